@@ -1,0 +1,141 @@
+# facetd. `make` builds the release, `make help` lists the targets.
+config ?= release
+CC_release := gcc
+ifneq ($(origin CC),default)
+CC_release := $(CC)
+endif
+PREFIX ?= /usr/local
+DESTDIR ?=
+
+ifeq ($(config),release)
+B := build
+else
+B := build/$(config)
+endif
+
+CC_debug := $(CC_release)
+CC_sanitize := clang
+CC_thread := clang
+CC_fuzz := clang
+CC := $(CC_$(config))
+FLAGS_release := -O2 -g
+FLAGS_debug := -O0 -g
+FLAGS_sanitize := -O1 -g -fsanitize=address,undefined -fno-sanitize-recover=all -fno-omit-frame-pointer
+FLAGS_thread := -O1 -g -fsanitize=thread -fno-omit-frame-pointer
+FLAGS_fuzz := -O1 -g -fsanitize=fuzzer-no-link,address,undefined -fno-sanitize-recover=all -fprofile-instr-generate -fcoverage-mapping
+ifeq ($(CC),)
+$(error config=$(config) is not known; use release, debug, sanitize, thread or fuzz)
+endif
+
+# -ffp-contract=off: the same bytes on every machine (law L2).
+PACKAGES := libuv yaml-0.1 jansson libpng libmodbus libsystemd
+have = $(shell pkg-config --exists $(1) 2>/dev/null && echo yes)
+CFLAGS_ALL := -std=c17 -D_GNU_SOURCE -I. -I$(B)/gen -MMD -MP -Wall -Wextra -Wshadow -Wstrict-prototypes \
+	-Wmissing-prototypes -Wvla -ffp-contract=off -fno-strict-aliasing -pthread $(FLAGS_$(config)) $(CFLAGS) \
+	$(shell pkg-config --cflags $(PACKAGES) 2>/dev/null)
+LDFLAGS_ALL := -pthread $(FLAGS_$(config)) $(LDFLAGS)
+LIBS := $(shell pkg-config --libs $(PACKAGES) 2>/dev/null) -lm
+
+VERSION := $(shell cat VERSION 2>/dev/null || echo 0)
+
+objects = $(patsubst %.c,$(B)/obj/%.o,$(1))
+CORE := $(wildcard core/*.c)
+CONFIG := $(wildcard config/*.c)
+DRIVERS := $(wildcard drivers/*.c)
+DAEMON := $(filter-out daemon/facetd.c,$(wildcard daemon/*.c))
+TOOLS := $(filter-out tools/facet.c,$(wildcard tools/*.c))
+TESTS := $(patsubst tests/%.c,%,$(wildcard tests/test_*.c))
+FUZZ := $(patsubst tests/%.c,%,$(wildcard tests/fuzz_*.c))
+LIBRARIES := $(B)/libtools.a $(B)/libdaemon.a $(B)/libdrivers.a $(B)/libconfig.a $(B)/libcore.a
+
+.PHONY: all tests check demo bench soak fuzz lint format deps install clean help run-check run-demo needed
+all: needed $(B)/facetd $(B)/facet
+tests: needed $(addprefix $(B)/tests/,$(TESTS))
+
+help:
+	@echo 'make [config=release|debug|sanitize|thread]   build/facetd and build/facet'
+	@echo 'make check   install what tests need, build, run them      make demo   a simulated robot, a mesh, a picture'
+	@echo 'make bench   figures of docs/features.md                   make fuzz   every fuzz target, FUZZ_SECONDS=300 each'
+	@echo 'make soak    ten minutes of faults                         make lint   layers, warnings, format, static checks'
+	@echo 'make format | deps | install DESTDIR= PREFIX= | clean'
+
+# A missing package is named before the compiler trips over it.
+needed:
+	@missing=$$(tools/deps --missing build) || { echo "make: missing packages: $$(echo $$missing); run 'make deps'" >&2; exit 1; }
+
+$(B)/obj/%.o: %.c Makefile | needed
+	@mkdir -p $(@D)
+	$(CC) $(CFLAGS_ALL) -DFACET_VERSION='"$(VERSION)"' -c -o $@ $<
+
+$(B)/libcore.a: $(call objects,$(CORE))
+$(B)/libconfig.a: $(call objects,$(CONFIG))
+$(B)/libdrivers.a: $(call objects,$(DRIVERS))
+$(B)/libdaemon.a: $(call objects,$(DAEMON))
+$(B)/libtools.a: $(call objects,$(TOOLS))
+$(B)/lib%.a:
+	@mkdir -p $(@D)
+	@rm -f $@
+	ar rcs $@ $^
+
+$(B)/facetd: $(B)/obj/daemon/facetd.o $(filter-out $(B)/libtools.a,$(LIBRARIES))
+	$(CC) $(LDFLAGS_ALL) -o $@ $^ $(LIBS)
+$(B)/facet: $(B)/obj/tools/facet.o $(LIBRARIES)
+	$(CC) $(LDFLAGS_ALL) -o $@ $^ $(LIBS)
+$(B)/tests/test_%: $(B)/obj/tests/test_%.o $(LIBRARIES)
+	@mkdir -p $(@D)
+	$(CC) $(LDFLAGS_ALL) -o $@ $^ $(LIBS) -lcmocka
+$(B)/tests/fuzz_%: $(B)/obj/tests/fuzz_%.o $(LIBRARIES)
+	@mkdir -p $(@D)
+	$(CC) $(LDFLAGS_ALL) -fsanitize=fuzzer -o $@ $^ $(LIBS)
+
+# Purposes are installed first and the build starts in a second make, whose pkg-config then knows them.
+check:
+	@tools/deps build check
+	@$(MAKE) --no-print-directory config=$(config) run-check
+run-check: all tests
+	@tests/run $(B)
+
+demo:
+	@tools/deps build
+	@$(MAKE) --no-print-directory run-demo
+run-demo: all
+	@tools/demo
+
+bench:
+	@tools/deps build check bench
+	@$(MAKE) --no-print-directory all
+	@bench/run
+
+soak: all tests
+	@tests/soak $(B)
+
+FUZZ_SECONDS ?= 300
+fuzz:
+	@tools/deps build check
+	@$(MAKE) --no-print-directory config=fuzz run-fuzz
+.PHONY: run-fuzz fuzz-targets
+fuzz-targets: needed $(addprefix $(B)/tests/,$(FUZZ))
+run-fuzz: fuzz-targets
+	@tests/fuzz $(B) $(FUZZ_SECONDS)
+
+lint:
+	@tools/deps build check lint
+	@tools/lint
+format:
+	@clang-format -i $(shell git ls-files '*.c' '*.h')
+
+deps:
+	@tools/deps build check lint bench
+
+install: all
+	install -d $(DESTDIR)$(PREFIX)/bin $(DESTDIR)$(PREFIX)/lib/systemd/system $(DESTDIR)$(PREFIX)/lib/sysusers.d \
+		$(DESTDIR)$(PREFIX)/share/doc/facetd
+	install -m 755 $(B)/facetd $(B)/facet $(DESTDIR)$(PREFIX)/bin
+	sed 's|@PREFIX@|$(PREFIX)|g' systemd/facetd.service.in > $(DESTDIR)$(PREFIX)/lib/systemd/system/facetd.service
+	install -m 644 systemd/facetd.sysusers $(DESTDIR)$(PREFIX)/lib/sysusers.d/facetd.conf
+	install -m 644 config/facetd.yaml $(DESTDIR)$(PREFIX)/share/doc/facetd/facetd.yaml
+
+clean:
+	rm -rf build demo
+
+-include $(shell find $(B)/obj -name '*.d' 2>/dev/null)

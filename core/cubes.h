@@ -1,0 +1,61 @@
+/* Marching cubes on one patch (decision D6; thesis 3.2, lecture 004 E.5.3.6).
+ *
+ * gather  copies the published values of the corners [-2, 18] of a patch and fills unknown corners;
+ * extract turns the cells [0, 16) into triangles on the lattice of 1/256 cell.
+ * A vertex is named by (voxel, axis); its place depends on that voxel and its neighbour along the axis only. */
+#ifndef FACET_CORE_CUBES_H
+#define FACET_CORE_CUBES_H
+
+#include "core/arena.h"
+#include "core/grid.h"
+
+#define WINDOW_LOW 2                                   /* corners below the patch */
+#define WINDOW_SIDE (PATCH_SIDE + 5)                   /* corners -2 .. 18 */
+#define WINDOW_VOXELS (WINDOW_SIDE * WINDOW_SIDE * WINDOW_SIDE)
+
+/* Corner values of a patch and its halo; index with window_at. Filled corners (-1 .. 17) carry their neighbour's value. */
+struct window {
+	struct patch_key key;
+	bool empty; /* no cell of the patch has a surface: nothing to extract */
+	int16_t value[WINDOW_VOXELS]; /* 1/256 cell, VOXEL_UNKNOWN */
+};
+
+static inline int window_at(int i, int j, int k) /* patch coordinates, -2 .. 18 */
+{
+	return ((k + WINDOW_LOW) * WINDOW_SIDE + (j + WINDOW_LOW)) * WINDOW_SIDE + (i + WINDOW_LOW);
+}
+
+/* Inside (behind a surface) is negative; zero counts as outside. */
+static inline bool corner_inside(int16_t value)
+{
+	return value < 0;
+}
+
+/* A cell is complete when its 8 corners are known. -1 .. 16 in each coordinate. */
+bool window_cell_complete(const struct window *, int i, int j, int k);
+
+/* Name of a vertex in its patch: the lower corner (0..16 each) and the axis of the grid edge. */
+static inline uint32_t vertex_name(int i, int j, int k, int axis)
+{
+	return (uint32_t)(((k * (PATCH_SIDE + 1) + j) * (PATCH_SIDE + 1) + i) * 3 + axis);
+}
+
+/* Triangles of a patch. Positions are lattice integers 0..4096 within the patch. Counter-clockwise seen from outside
+ * (free space). All arrays live in the arena they were made in. */
+struct surface {
+	uint32_t nv, nt;
+	uint16_t (*vertex)[3];
+	uint32_t *name;         /* [nv] vertex_name, raw meshes only; NULL after the reduction */
+	uint32_t (*triangle)[3];
+	uint32_t *plane;        /* [nt] id of the planar region, local to the patch, or UINT32_MAX; NULL: none */
+};
+
+void cubes_gather(const struct grid *, struct patch_key, struct window *ret);
+
+/* 0, or -ENOMEM. Vertices and triangles come in a canonical order (by cell, then by the table). */
+int cubes_extract(const struct window *, struct arena *, struct surface *ret);
+
+/* The table: triangles of a case as triples of cube edges, ended by -1 (cubes_table.c). Edge e of a cube: see there. */
+extern const int8_t cubes_triangles[256][16];
+
+#endif

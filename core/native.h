@@ -1,0 +1,86 @@
+/* The native protocol's bytes: framed little-endian messages (interfaces, section 4; docs/protocol.md).
+ * Pure encoders and decoders, shared by the daemon and its clients. */
+#ifndef FACET_CORE_NATIVE_H
+#define FACET_CORE_NATIVE_H
+
+#include <sys/types.h>
+
+#include "core/model.h"
+#include "core/patch.h"
+
+#define NATIVE_MAJOR 1
+#define NATIVE_MINOR 0
+#define NATIVE_PORT 7878
+#define NATIVE_HEAD 8                    /* u32 length of what follows, u8 type, u8 flags, u16 0 */
+#define NATIVE_FROM_CLIENT_MAX (64u << 10)
+#define NATIVE_TO_CLIENT_MAX (16u << 20)
+
+enum native_type {
+	NATIVE_HELLO = 1, NATIVE_WANT, NATIVE_BEGIN, NATIVE_PATCH, NATIVE_REMOVE, NATIVE_PLANE, NATIVE_PLANE_GONE,
+	NATIVE_COMMIT, NATIVE_ABORT, NATIVE_JSON, NATIVE_PING
+};
+
+struct native_hello {
+	uint16_t major, minor;
+	uint8_t map_id[16];
+	uint32_t generation;
+	double cell_m;
+	uint64_t step;
+	int64_t t_ns;
+};
+
+struct native_want {
+	uint8_t flags; /* 1 planes, 2 coded, 4 box, 8 radius */
+	uint32_t bytes_per_s;
+	float region[6];
+};
+
+struct native_begin {
+	uint64_t step;
+	uint32_t patches, removals;
+	bool reset;
+};
+
+/* One decoded message. Pointers in `patch` belong to the message: native_message_finish. */
+struct native_message {
+	enum native_type type;
+	union {
+		struct native_hello hello;
+		struct native_want want;
+		struct native_begin begin;
+		struct patch *patch;        /* PATCH: reference 1 */
+		struct patch_key remove;
+		uint64_t step;              /* COMMIT, ABORT */
+		struct { const char *text; size_t len; } json; /* borrowed from the bytes */
+	};
+};
+
+/* Each appends one whole frame. */
+void native_put_hello(struct buffer *, const struct native_hello *);
+void native_put_want(struct buffer *, const struct native_want *); /* pads: no length whose low byte is 0x3F or 0x7B */
+void native_put_begin(struct buffer *, const struct native_begin *);
+void native_put_patch(struct buffer *, const struct patch *);
+void native_put_remove(struct buffer *, struct patch_key);
+void native_put_step(struct buffer *, enum native_type commit_or_abort, uint64_t step);
+void native_put_json(struct buffer *, const char *text, size_t len);
+void native_put_ping(struct buffer *);
+
+/* Bytes of the first whole frame, 0: more is needed, -EPROTO: no frame can begin so (length beyond `max`, reserved bytes). */
+ssize_t native_scan(const uint8_t *data, size_t len, size_t max);
+
+/* Decodes one whole frame; -EPROTO with a sentence where it is not valid (every count judged before use); -ENOTSUP for
+ * a type this version does not know (skip it). */
+int native_decode(const uint8_t *frame, size_t len, struct native_message *ret, char error[128]);
+void native_message_finish(struct native_message *);
+
+/* What a client holds: patches as of its last COMMIT, changed by whole batches only. */
+struct native_mirror;
+struct native_mirror *native_mirror_create(void);
+void native_mirror_destroy(struct native_mirror *);
+/* 0; 1 when the message was a COMMIT (the mirror changed); -EPROTO with a sentence. Takes the message's patch over. */
+int native_mirror_apply(struct native_mirror *, struct native_message *, char error[128]);
+const struct patch_store *native_mirror_patches(const struct native_mirror *);
+const struct native_hello *native_mirror_hello(const struct native_mirror *); /* NULL before HELLO */
+uint64_t native_mirror_step(const struct native_mirror *);
+
+#endif

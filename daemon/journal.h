@@ -1,0 +1,24 @@
+/* The journal: what the loop handed to the pipeline, in that order (law L7). A sink of records; the daemon calls it
+ * before pipeline_handle. Kept in memory by tests; a recording file comes later on the same seam. */
+#ifndef FACET_DAEMON_JOURNAL_H
+#define FACET_DAEMON_JOURNAL_H
+
+#include "daemon/pipeline.h"
+
+struct journal_sink {
+	void *ctx;
+	void (*record)(void *ctx, const struct record *);
+	void (*tick)(void *ctx, int64_t log_ns);
+	void (*not_applied)(void *ctx, uint64_t number);
+};
+
+/* A list kept in a file (tests, `facetd --journal FILE` for them): plain bytes, described in journal.c. */
+struct journal;
+struct journal *journal_create(const char *path, char error[160]);
+void journal_destroy(struct journal *);
+void journal_sink(struct journal *, struct journal_sink *ret);
+
+/* Feeds a kept list into `pipeline` (rows not applied are skipped first). 0, or -EINVAL / -errno with a sentence. */
+int journal_feed(const char *path, struct pipeline *, char error[160]);
+
+#endif

@@ -1,0 +1,43 @@
+/* The pipeline: one reading's way from the wire to the map's rows. It alone joins decoders, assemblers and the row sink.
+ *
+ *   record -> decoder -> profile | tilt | pose -> assembler -> row, numbered -> row sink (the worker's queue, or a map)
+ *
+ * Driven by records and ticks only (law L7): the same list of records gives the same rows, live or kept. */
+#ifndef FACET_DAEMON_PIPELINE_H
+#define FACET_DAEMON_PIPELINE_H
+
+#include "config/config.h"
+#include "core/sweep.h"
+#include "drivers/driver.h"
+
+struct pipeline;
+
+struct pipeline_sink {
+	void *ctx;
+	/* Takes the row over. False: not applied (queue full); the pipeline counts it and reports it by `not_applied`. */
+	bool (*row)(void *ctx, struct row *row);
+	/* Row `number` will not be applied: an event for the recording. May be NULL. */
+	void (*not_applied)(void *ctx, uint64_t number, const char *reason);
+	/* A second of recorded time passed without a row: what waits for its look-ahead is folded now. */
+	void (*flush)(void *ctx);
+	/* Replies and signs of life for the devices' dialogues. May be NULL (replay). */
+	void (*reply)(void *ctx, int device, const struct reply *);
+	void (*data)(void *ctx, int device, int64_t t_ns);
+};
+
+struct pipeline *pipeline_create(const struct config *, const struct pipeline_sink *); /* NULL when memory is out */
+void pipeline_destroy(struct pipeline *);
+
+void pipeline_handle(struct pipeline *, const struct record *);
+void pipeline_tick(struct pipeline *, int64_t log_ns); /* the recorded 10 Hz tick */
+void pipeline_skip(struct pipeline *, uint64_t number); /* replay: this row was not applied live */
+void pipeline_end(struct pipeline *);                   /* end of the input: hand out what waits, then flush */
+
+struct pipeline_stats {
+	uint64_t rows, not_applied;
+	struct sweep_stats sweep; /* summed over the scanners */
+};
+void pipeline_stats(const struct pipeline *, struct pipeline_stats *ret);
+void pipeline_counters(const struct pipeline *, int device, struct decoder_counters *ret);
+
+#endif

@@ -1,0 +1,68 @@
+/* Simulated devices: implementations of the wire, never flags in the program (style, rule 6). They stand on one libuv
+ * loop (the Modbus server in a thread of its own) and share one physical model, the scene. */
+#ifndef FACET_TOOLS_SIMULATOR_H
+#define FACET_TOOLS_SIMULATOR_H
+
+#include <uv.h>
+
+#include "core/types.h"
+
+/* What a scanner would measure. A world that moves continuously answers any time; a played recording is paced by its
+ * reader: its scanner measures only when `ready`. */
+struct scene {
+	void *ctx;
+	/* Fills range_m and state of `profile`, whose times, bearings and n are set: each beam cast at its own time. */
+	void (*scan)(void *ctx, struct profile *profile);
+	/* May a profile begin at t_ns? NULL: always. Asked at every start of a mirror turn while streaming. */
+	bool (*ready)(void *ctx, int64_t t_ns);
+	/* The profile begun last was taken by its reader (nothing of it is left in the line). May be NULL. */
+	void (*taken)(void *ctx, int64_t t_ns);
+};
+
+/* An LMS2xx on a pseudo-terminal. The mirror turns all the time; profiles begin at its phase. */
+struct sim_lms2xx_params {
+	const char *link;     /* path of the symbolic link that is made to the pty's slave */
+	bool fast;            /* drop the wire's pace (not the mirror's): bytes go as fast as they are read */
+	uint32_t baud;        /* rate the device starts with: 9600 as from the factory */
+	int mode;             /* measuring mode in its configuration (protocols A.6), e.g. 0x05: 15 bit */
+	bool millimetres;
+};
+struct sim_lms2xx;
+/* NULL with one sentence in `error`. */
+struct sim_lms2xx *sim_lms2xx_create(uv_loop_t *, const struct sim_lms2xx_params *, const struct scene *, char error[160]);
+void sim_lms2xx_destroy(struct sim_lms2xx *); /* closes the pty, removes the link */
+void sim_lms2xx_power_cycle(struct sim_lms2xx *); /* says 90, falls back to its power-on rate and state */
+
+/* A servo behind Modbus (libmodbus server): really moves with a speed. Position in 0.001 degree, i32 in two registers. */
+enum sim_servo_register { /* holding registers, also readable as input registers; 32-bit values high word first */
+	SIM_SERVO_POSITION = 0, /* 0,1: actual position */
+	SIM_SERVO_TARGET = 2,   /* 2,3: where to go */
+	SIM_SERVO_SPEED = 4,    /* 4,5: 0.001 degree/s, unsigned */
+	SIM_SERVO_MOVING = 6,   /* 1 while it moves */
+	SIM_SERVO_REGISTERS = 16
+};
+struct sim_servo_params {
+	const char *rtu;  /* path of the link to a pty's slave (8N1), or NULL */
+	const char *tcp;  /* host:port, port 0: any; or NULL */
+	int slave;        /* unit id */
+	double angle_rad; /* where it stands at first, in the servo's own sense */
+};
+struct sim_servo;
+struct sim_servo *sim_servo_create(const struct sim_servo_params *, char error[160]);
+void sim_servo_destroy(struct sim_servo *);
+int sim_servo_port(const struct sim_servo *);                     /* TCP port it listens on */
+double sim_servo_angle(struct sim_servo *, int64_t t_ns);         /* rad, at any time within the last seconds; any thread */
+void sim_servo_place(struct sim_servo *, double angle_rad);       /* stands there from now on (playback steps) */
+uint64_t sim_servo_answers(struct sim_servo *);                   /* position reads answered so far */
+
+/* Built-in worlds of flat and round things; distances in metres, map frame (z up, floor at 0). */
+struct world;
+struct world *world_create(const char *name, char error[160]);    /* "building", "hall" */
+void world_destroy(struct world *);
+/* Distance to the first surface along the unit direction, or a negative number for none within `max_m`. */
+double world_cast(const struct world *, struct vec3 origin, struct vec3 direction, double max_m);
+/* Where the simulated robot is (base frame) at `t_s` seconds after the start; the drive ends at world_drive_seconds. */
+struct pose world_drive(const struct world *, double t_s);
+double world_drive_seconds(const struct world *);
+
+#endif

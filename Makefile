@@ -90,7 +90,7 @@ $(B)/tests/fuzz_%: $(B)/obj/tests/fuzz_%.o $(LIBRARIES)
 
 # Purposes are installed first and the build starts in a second make, whose pkg-config then knows them.
 check:
-	@tools/deps build check
+	@tools/deps build check check-$$(uname -m)
 	@$(MAKE) --no-print-directory config=$(config) run-check
 run-check: all tests
 	@tests/run $(B)
@@ -111,7 +111,7 @@ soak: all tests
 
 FUZZ_SECONDS ?= 300
 fuzz:
-	@tools/deps build check
+	@tools/deps build check check-$$(uname -m)
 	@$(MAKE) --no-print-directory config=fuzz run-fuzz
 .PHONY: run-fuzz fuzz-targets
 fuzz-targets: needed $(addprefix $(B)/tests/,$(FUZZ))
@@ -125,7 +125,7 @@ format:
 	@clang-format -i $(shell git ls-files '*.c' '*.h')
 
 deps:
-	@tools/deps build check lint bench
+	@tools/deps build check check-$$(uname -m) lint bench
 
 install: all
 	install -d $(DESTDIR)$(PREFIX)/bin $(DESTDIR)$(PREFIX)/lib/systemd/system $(DESTDIR)$(PREFIX)/lib/sysusers.d \

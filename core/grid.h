@@ -1,4 +1,5 @@
-/* HashGrid: a sparse grid of integer voxels in blocks of 8x8x8, any integer coordinates (thesis 3.3.1; laws L2, L3, L9).
+/* HashGrid: a sparse grid of integer voxels in blocks of 8x8x8, any integer coordinates (thesis 3.3.1; laws L2, L3,
+ * L9).
  *
  * Corner (voxel) i,j,k lies at (i,j,k) * cell. Block = i >> 3, patch = i >> 4 (interfaces, section 2).
  * A voxel keeps integer sums, never a running average, and the value it has *published* to meshes: the fold takes the
@@ -10,13 +11,13 @@
 #include <stddef.h>
 #include <stdint.h>
 
-#define BLOCK_SHIFT 3
-#define BLOCK_SIDE (1 << BLOCK_SHIFT)
-#define BLOCK_VOXELS (BLOCK_SIDE * BLOCK_SIDE * BLOCK_SIDE)
-#define PATCH_SHIFT 4
-#define PATCH_SIDE (1 << PATCH_SHIFT) /* cells a side; a build constant */
-#define LATTICE 256                   /* lattice units a cell */
-#define GRID_PATCH_LIMIT (1 << 18)    /* what lies beyond +-this many patches is dropped and counted */
+#define BLOCK_SHIFT      3
+#define BLOCK_SIDE       (1 << BLOCK_SHIFT)
+#define BLOCK_VOXELS     (BLOCK_SIDE * BLOCK_SIDE * BLOCK_SIDE)
+#define PATCH_SHIFT      4
+#define PATCH_SIDE       (1 << PATCH_SHIFT) /* cells a side; a build constant */
+#define LATTICE          256                /* lattice units a cell */
+#define GRID_PATCH_LIMIT (1 << 18)          /* what lies beyond +-this many patches is dropped and counted */
 
 /* `published` of a voxel no surface has been seen near. */
 #define VOXEL_UNKNOWN INT16_MIN
@@ -37,12 +38,14 @@ struct patch_key {
 
 struct block {
 	struct block_key key;
+	uint16_t negatives;               /* voxels with a negative sum, kept by the field: what a ray may clear */
 	struct voxel voxel[BLOCK_VOXELS]; /* index (z * 8 + y) * 8 + x */
 };
 
 struct grid;
 
-/* `memory` bytes is the cap of everything the grid owns: at the cap new blocks are refused and counted (L9). */
+/* `memory` bytes is the cap of everything the grid owns: at the cap new blocks are refused and counted (L9). What it
+ * owns depends on the blocks alone, not on when dirty patches were taken (L2). */
 struct grid *grid_create(size_t memory);
 void grid_destroy(struct grid *);
 
@@ -55,8 +58,8 @@ struct block *grid_touch(struct grid *, struct block_key);
 /* Published value of any voxel; VOXEL_UNKNOWN where there is no block. */
 int16_t grid_published(const struct grid *, int32_t i, int32_t j, int32_t k);
 
-/* Marks every patch that reads a voxel of `block` whose published value changed (patches (i-3)>>4 .. (i+2)>>4 per axis);
- * `layers[axis]` has bit b set where a voxel in layer b along that axis changed. */
+/* Marks every patch that reads a voxel of `block` whose published value changed (patches (i-3)>>4 .. (i+2)>>4 per
+ * axis); `layers[axis]` has bit b set where a voxel in layer b along that axis changed. */
 void grid_mark_changed(struct grid *, struct block_key, const uint8_t layers[3]);
 
 /* The dirty patches in ascending key order (z, then y, then x), and none are dirty afterwards.

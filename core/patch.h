@@ -38,7 +38,8 @@ struct patch_store;
 struct patch_store *patch_store_create(void);
 void patch_store_destroy(struct patch_store *);
 
-/* Takes the reference over. A patch with nt == 0 stays as a tombstone, so that clients learn of the removal. 0 or -ENOMEM. */
+/* Takes the reference over. A patch with nt == 0 stays as a tombstone, so that clients learn of the removal. 0, or
+ * -ENOMEM: then the reference stays with the caller. Any order of versions will do; a put takes O(log n). */
 int patch_store_put(struct patch_store *, struct patch *);
 
 /* NULL where none was ever put; a tombstone where it is gone. Borrowed. */
@@ -48,10 +49,18 @@ struct patch *patch_store_get(const struct patch_store *, struct patch_key);
  * (or NULL to begin). Borrowed; NULL at the end. */
 struct patch *patch_store_after(const struct patch_store *, uint64_t version, const struct patch *last);
 size_t patch_store_count(const struct patch_store *); /* without tombstones */
-size_t patch_store_bytes(const struct patch_store *);
+size_t patch_store_bytes(const struct patch_store *); /* of patches, tombstones and the store itself */
 
-/* SHA-256 over the living patches in key order as `--stats` prints it (interfaces, section 1): key, counts, lattice
- * integers, triangles rotated, plane ids renumbered by first use. 64 hex digits and a NUL. */
+/* The living patches in key order, borrowed; the array is the caller's to free. NULL in *ret_patches: memory is out. */
+size_t patch_store_living(const struct patch_store *, struct patch ***ret_patches);
+
+/* SHA-256 over the living patches in key order, as `--stats` prints it (interfaces, section 1): 64 hex digits and a NUL;
+ * an empty string when memory is out. Bytes of a patch, all integers little-endian:
+ *   i32 key x, y, z; u32 vertices; u32 triangles;
+ *   u16 x, y, z of every vertex (lattice); u32 a, b, c of every triangle (rotated to begin with its smallest index);
+ *   for every run: u32 plane, u32 triangles.
+ * Planes are numbered by first use within the patch, from 0; PLANE_NONE stays 0xffffffff. Versions, times and classes
+ * do not enter. */
 void patch_store_hash(const struct patch_store *, char ret_hex[65]);
 
 #endif

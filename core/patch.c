@@ -62,7 +62,7 @@ static size_t patch_bytes(const struct patch *patch)
 	       patch->nv * sizeof *patch->vertex;
 }
 
-static struct patch *patch_allocate(struct patch_key key, uint32_t nv, uint32_t nt, uint32_t nruns)
+struct patch *patch_allocate(struct patch_key key, uint32_t nv, uint32_t nt, uint32_t nruns)
 {
 	struct patch sizes = {.nv = nv, .nt = nt, .nruns = nruns};
 	struct patch *patch = calloc(1, patch_bytes(&sizes));

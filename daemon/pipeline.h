@@ -25,19 +25,25 @@ struct pipeline_sink {
 	void (*data)(void *ctx, int device, int64_t t_ns);
 };
 
-struct pipeline *pipeline_create(const struct config *, const struct pipeline_sink *); /* NULL when memory is out */
+/* NULL when memory is out. The configuration is borrowed and must outlive the pipeline; its drivers are known ones. */
+struct pipeline *pipeline_create(const struct config *, const struct pipeline_sink *);
 void pipeline_destroy(struct pipeline *);
 
 void pipeline_handle(struct pipeline *, const struct record *);
 void pipeline_tick(struct pipeline *, int64_t log_ns); /* the recorded 10 Hz tick */
 void pipeline_skip(struct pipeline *, uint64_t number); /* replay: this row was not applied live */
 void pipeline_end(struct pipeline *);                   /* end of the input: hand out what waits, then flush */
+void pipeline_reset(struct pipeline *); /* a new map: rows are numbered from 0 again, the numbers to skip are forgotten */
+
+/* Within the sink's `row`: log time of the last byte of the profile that the row is made of. */
+int64_t pipeline_arrival_ns(const struct pipeline *);
 
 struct pipeline_stats {
 	uint64_t rows, not_applied;
 	struct sweep_stats sweep; /* summed over the scanners */
 };
 void pipeline_stats(const struct pipeline *, struct pipeline_stats *ret);
+int pipeline_devices(const struct pipeline *);
 void pipeline_counters(const struct pipeline *, int device, struct decoder_counters *ret);
 
 #endif

@@ -1,0 +1,201 @@
+/* What one key says about another: names that must exist, addresses that must be local, values that fit together. */
+#include <ctype.h>
+#include <errno.h>
+#include <string.h>
+
+#include "config/address.h"
+#include "config/reader.h"
+
+static int device_line(const struct reader *r, int device, const char *key)
+{
+	return reader_line(r, r->device_node[device], key);
+}
+
+static int check_name(struct reader *r, const struct config *config, int i)
+{
+	const char *name = config->device[i].name;
+	char shown[READER_SHOWN_MAX];
+	bool good = isalpha((unsigned char)name[0]);
+	for (const char *c = name; *c; c++)
+		good = good && (isalnum((unsigned char)*c) || *c == '-' || *c == '_') && (unsigned char)*c < 128;
+	if (!good)
+		return reader_fail(
+		    r, device_line(r, i, "name"),
+		    "devices[%d].name: '%s' must begin with a letter and hold letters, digits, - and _ only", i,
+		    reader_shown(name, shown));
+	for (int j = 0; j < i; j++)
+		if (strcmp(config->device[j].name, name) == 0)
+			return reader_fail(
+			    r, device_line(r, i, "name"),
+			    "devices[%d].name: '%s' is also the name of the device of line %d; names are unique", i,
+			    name, config->device[j].line);
+	return 0;
+}
+
+static const struct config_device *find_device(const struct config *config, const char *name)
+{
+	for (int i = 0; i < config->devices; i++)
+		if (strcmp(config->device[i].name, name) == 0)
+			return &config->device[i];
+	return NULL;
+}
+
+static bool is_tilt(const struct config_device *device)
+{
+	return keys_driver(device->driver) == KEY_MODBUS;
+}
+
+/* The name of the first device that tilts, for messages. */
+static const char *any_tilt(const struct config *config)
+{
+	for (int i = 0; i < config->devices; i++)
+		if (is_tilt(&config->device[i]))
+			return config->device[i].name;
+	return "none";
+}
+
+static int check_tilt_name(struct reader *r, const struct config *config, const char *key, const char *name, int line)
+{
+	char shown[READER_SHOWN_MAX];
+	const struct config_device *device = find_device(config, name);
+	if (!device)
+		return reader_fail(r, line, "%s: there is no device '%s'; devices that tilt: %s", key,
+		                   reader_shown(name, shown), any_tilt(config));
+	if (!is_tilt(device))
+		return reader_fail(r, line, "%s: the device '%s' tilts nothing (driver %s); devices that tilt: %s", key,
+		                   name, device->driver, any_tilt(config));
+	return 0;
+}
+
+static int check_line_shared(struct reader *r, const struct config *config, int i)
+{
+	const struct config_device *device = &config->device[i];
+	for (int j = 0; j < i; j++) {
+		const struct config_device *other = &config->device[j];
+		const char *mine = device->port[0] ? device->port : device->connect;
+		const char *theirs = other->port[0] ? other->port : other->connect;
+		if (mine[0] && strcmp(mine, theirs) == 0)
+			return reader_fail(r, device_line(r, i, device->port[0] ? "port" : "connect"),
+			                   "devices[%d]: '%s' is already the line of '%s'", i, mine, other->name);
+	}
+	return 0;
+}
+
+static int check_modbus(struct reader *r, const struct config_device *device, int i)
+{
+	const struct {
+		const char *name;
+		const struct config_register *value;
+	} registers[] = {{"position", &device->position}, {"target", &device->target}, {"speed", &device->speed}};
+	for (size_t k = 0; k < 3; k++)
+		if (registers[k].value->set && registers[k].value->address < device->address_base)
+			return reader_fail(r, device_line(r, i, registers[k].name),
+			                   "devices[%d].%s.address: with address_base 1 the first register is 1", i,
+			                   registers[k].name);
+	for (int k = 0; k < device->writes; k++)
+		if (device->write[k].address < device->address_base)
+			return reader_fail(r, device_line(r, i, "write"),
+			                   "devices[%d].write: with address_base 1 the first register is 1", i);
+	struct address address;
+	char sentence[ADDRESS_ERROR_MAX];
+	if (device->connect[0] != '/' && address_parse_host(device->connect, &address, sentence))
+		return reader_fail(r, device_line(r, i, "connect"), "devices[%d].connect: %s", i, sentence);
+	return 0;
+}
+
+static int check_pose(struct reader *r, const struct config *config, int i)
+{
+	const struct config_device *device = &config->device[i];
+	if (device->fixed == (device->listen[0] != '\0'))
+		return reader_fail(r, device->line, "devices[%d]: a pose device has either `listen` or `fixed`", i);
+	for (int j = 0; j < i; j++)
+		if (keys_driver(config->device[j].driver) == KEY_POSE)
+			return reader_fail(
+			    r, device->line,
+			    "devices[%d]: '%s' already says where the robot is; one pose device is possible", i,
+			    config->device[j].name);
+	if (device->fixed)
+		return 0;
+	struct address address;
+	char sentence[ADDRESS_ERROR_MAX];
+	int error = address_parse(device->listen, ADDRESS_UNIX | ADDRESS_UDP, &address, sentence);
+	if (!error)
+		error = address_check_loopback(&address, sentence);
+	return error ? reader_fail(r, device_line(r, i, "listen"), "devices[%d].listen: %s", i, sentence) : 0;
+}
+
+static int check_device(struct reader *r, const struct config *config, int i)
+{
+	const struct config_device *device = &config->device[i];
+	char key[40];
+	snprintf(key, sizeof(key), "devices[%d].tilt", i);
+	int error = check_name(r, config, i);
+	if (!error)
+		error = check_line_shared(r, config, i);
+	if (!error && device->tilt[0])
+		error = check_tilt_name(r, config, key, device->tilt, device_line(r, i, "tilt"));
+	if (!error && keys_driver(device->driver) == KEY_MODBUS)
+		error = check_modbus(r, device, i);
+	if (!error && keys_driver(device->driver) == KEY_POSE)
+		error = check_pose(r, config, i);
+	return error;
+}
+
+static int check_sweep(struct reader *r, const struct config *config)
+{
+	const int node = reader_child(r, r->tree->root, "sweep");
+	if (!config->sweep.set)
+		return 0;
+	const int error =
+	    check_tilt_name(r, config, "sweep.device", config->sweep.device, reader_line(r, node, "device"));
+	if (error)
+		return error;
+	if (!find_device(config, config->sweep.device)->target.set)
+		return reader_fail(r, reader_line(r, node, "device"),
+		                   "sweep.device: '%s' has no `target` register, so it cannot be commanded",
+		                   config->sweep.device);
+	if (config->sweep.from_rad >= config->sweep.to_rad)
+		return reader_fail(r, reader_line(r, node, "from"), "sweep.from: must be smaller than sweep.to");
+	return 0;
+}
+
+static int check_box(struct reader *r, const struct config *config)
+{
+	const struct vec3 a = config->robot.box_min, b = config->robot.box_max;
+	const int node = reader_child(r, reader_child(r, r->tree->root, "robot"), "box");
+	if (config->robot.has_box && !(a.x < b.x && a.y < b.y && a.z < b.z))
+		return reader_fail(r, reader_line(r, node, "min"),
+		                   "robot.box: min must be smaller than max on every axis");
+	return 0;
+}
+
+static int check_listen(struct reader *r, const struct config *config)
+{
+	const int line = reader_line(r, reader_child(r, r->tree->root, "listen"), "native");
+	for (int i = 0; i < config->listen.natives; i++) {
+		const char *text = config->listen.native[i];
+		struct address address;
+		char sentence[ADDRESS_ERROR_MAX];
+		int error = address_parse(text, ADDRESS_UNIX | ADDRESS_TCP, &address, sentence);
+		if (!error)
+			error = address_check_loopback(&address, sentence);
+		if (error)
+			return reader_fail(r, line, "listen.native: %s", sentence);
+		for (int j = 0; j < i; j++)
+			if (strcmp(config->listen.native[j], text) == 0)
+				return reader_fail(r, line, "listen.native: '%s' is written twice", text);
+	}
+	return 0;
+}
+
+int config_check(struct reader *r, const struct config *config)
+{
+	int error = 0;
+	for (int i = 0; i < config->devices && !error; i++)
+		error = check_device(r, config, i);
+	if (!error)
+		error = check_sweep(r, config);
+	if (!error)
+		error = check_box(r, config);
+	return error ? error : check_listen(r, config);
+}

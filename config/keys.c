@@ -1,0 +1,217 @@
+/* Adding a key: one entry here, and a field in config.h where it is stored. The reader (config.c) knows types, never
+ * names; what one key says about another is in check.c. Order in the table is order in the manual.
+ *
+ * Keys that belong to later work are in the table with `later`: they are accepted at their default, so that a file
+ * written for a newer version can be read as long as it asks for nothing this version cannot do. */
+#include "config/keys.h"
+
+#include <stddef.h>
+#include <string.h>
+
+#define WHERE(type, member) .offset = offsetof(type, member), .size = sizeof(((type *)0)->member)
+#define CONFIG(member)      WHERE(struct config, member)
+#define DEVICE(member)      WHERE(struct config_device, member)
+#define REGISTER_(member)   WHERE(struct config_register, member)
+#define DEG(x)              ((x)*0.017453292519943295)
+#define MEGA                1048576.0
+
+/* clang-format off */
+const struct key key_table[] = {
+	{GROUP_TOP, "map", KEY_GROUP, .inner = GROUP_MAP, .help = "The map: a signed distance in every voxel near a surface, turned into triangles."},
+	{GROUP_TOP, "robot", KEY_GROUP, .inner = GROUP_ROBOT, .help = "The robot's own body and what it can climb."},
+	{GROUP_TOP, "mount", KEY_GROUP, .inner = GROUP_MOUNT, .help = "Where the scanner sits: map <- base <- tilt axis <- laser, x forward, y left, z up. The lever arm from the axis to the mirror's centre matters: without it walls become double."},
+	{GROUP_TOP, "devices", KEY_DEVICES, .inner = GROUP_DEVICE, .help = "What is plugged in; at most 16. Every device has a name and a driver: lms2xx (SICK LMS200, 211, 220, 221, 291), modbus (a servo that tilts the scanner), pose (the robot's localisation)."},
+	{GROUP_TOP, "sweep", KEY_GROUP, .inner = GROUP_SWEEP, .flag = offsetof(struct config, sweep.set), .help = "How the servo is commanded. Without this section it is only listened to."},
+	{GROUP_TOP, "listen", KEY_GROUP, .inner = GROUP_LISTEN, .help = "Where clients connect."},
+	{GROUP_TOP, "record", KEY_GROUP, .inner = GROUP_RECORD, .help = "Recordings of what the devices sent."},
+	{GROUP_TOP, "state", KEY_GROUP, .inner = GROUP_STATE, .help = "The map on disk, over restarts."},
+
+	{GROUP_MAP, "cell", KEY_REAL, .preset = "0.05", .dimension = DIMENSION_LENGTH, .min = 0.01, .max = 1, CONFIG(map.cell_m), .help = "Edge of a voxel. Half of it needs four times the memory."},
+	{GROUP_MAP, "field", KEY_CHOICE, .preset = "distance", .choices = "distance|hoppe|direct", .later = "the fields hoppe and direct", .help = "How a corner gets its value."},
+	{GROUP_MAP, "planes", KEY_SWITCH, .preset = "off", CONFIG(map.planes), .later = "the map-wide registry of planes", .help = "Pull vertices onto planes found over the whole map."},
+	{GROUP_MAP, "reduce", KEY_SWITCH, .preset = "on", CONFIG(map.reduce), .help = "Replace flat parts by few large triangles."},
+	{GROUP_MAP, "tolerance", KEY_REAL, .preset = "0.25", .min = 0.01, .max = 1, CONFIG(map.tolerance), .help = "How far the reduced surface may be from the unreduced one, in cells."},
+	{GROUP_MAP, "snap", KEY_REAL, .preset = "0.15", .min = 0, .max = 0.5, CONFIG(map.snap), .help = "How far a vertex may be moved onto a plane, in cells. Used with planes only."},
+	{GROUP_MAP, "lookahead", KEY_INTEGER, .preset = "2", .min = 0, .max = 8, CONFIG(map.lookahead), .help = "Rows a row waits for, so that its normals know both sides. Counts as latency."},
+	{GROUP_MAP, "memory", KEY_INTEGER, .preset = "256M", .dimension = DIMENSION_BYTES, .min = 16 * MEGA, .max = 65536 * MEGA, CONFIG(map.memory), .help = "Everything the map may own. At the limit new blocks are refused, counted and reported."},
+	{GROUP_MAP, "hold", KEY_DURATION, .preset = "30ms", .dimension = DIMENSION_TIME, .min = 0, .max = 1, CONFIG(map.hold_ns), .help = "How long a profile waits for newer tilt and pose samples."},
+	{GROUP_MAP, "window", KEY_TEXT, .preset = "none", .later = "a map that forgets what lies far behind", .help = "Keep only what is near the robot."},
+
+	{GROUP_ROBOT, "box", KEY_GROUP, .inner = GROUP_BOX, .flag = offsetof(struct config, robot.has_box), .example = "{min: [-0.4, -0.3, -0.5], max: [0.3, 0.3, 0.2]}", .help = "Beams that end in this box of the base frame are the robot itself: dropped, and they clear nothing. Leave it out where no beam can hit the robot."},
+	{GROUP_ROBOT, "step", KEY_REAL, .preset = "0.05", .dimension = DIMENSION_LENGTH, .min = 0, .max = 1, .later = "the classes of surfaces", .help = "Height the robot can climb."},
+	{GROUP_ROBOT, "slope", KEY_REAL, .preset = "15deg", .dimension = DIMENSION_ANGLE, .min = 0, .max = DEG(90), .later = "the classes of surfaces", .help = "Slope the robot can climb."},
+	{GROUP_BOX, "min", KEY_VECTOR, .required = true, .dimension = DIMENSION_LENGTH, .min = -100, .max = 100, CONFIG(robot.box_min), .help = "Lower corner: x, y, z."},
+	{GROUP_BOX, "max", KEY_VECTOR, .required = true, .dimension = DIMENSION_LENGTH, .min = -100, .max = 100, CONFIG(robot.box_max), .help = "Upper corner: x, y, z."},
+
+	{GROUP_MOUNT, "base_tilt", KEY_TRANSFORM, .preset = "{xyz: [0, 0, 0], rpy: [0, 0, 0]}", .example = "{xyz: [0.2, 0, 0.4], rpy: [0, 0, 0]}", .inner = GROUP_FRAME, CONFIG(mount.base_tilt), .help = "The tilt axis in the base frame: the axis is y, positive angles look down. Without a servo: where the scanner is mounted."},
+	{GROUP_MOUNT, "tilt_laser", KEY_TRANSFORM, .preset = "{xyz: [0, 0, 0], rpy: [0, 0, 0]}", .example = "{xyz: [0, 0, 0.05], rpy: [0, 0, 0]}", .inner = GROUP_FRAME, CONFIG(mount.tilt_laser), .help = "The mirror's centre, seen from the axis at angle 0."},
+	{GROUP_FRAME, "xyz", KEY_VECTOR, .preset = "[0, 0, 0]", .dimension = DIMENSION_LENGTH, .min = -1e6, .max = 1e6, .offset = 0, .size = sizeof(struct vec3), .help = "Position."},
+	{GROUP_FRAME, "rpy", KEY_VECTOR, .preset = "[0, 0, 0]", .dimension = DIMENSION_ANGLE, .min = DEG(-360), .max = DEG(360), .offset = sizeof(struct vec3), .size = sizeof(struct vec3), .help = "Roll, pitch, yaw about the fixed axes x, y, z."},
+
+	{GROUP_DEVICE, "name", KEY_TEXT, KEY_ALL, .required = true, DEVICE(name), .help = "What messages, `tilt` and `sweep.device` call it: letters, digits, - and _."},
+	{GROUP_DEVICE, "driver", KEY_TEXT, KEY_ALL, .required = true, .choices = "lms2xx|modbus|pose", DEVICE(driver), .help = "What it is."},
+
+	{GROUP_DEVICE, "port", KEY_TEXT, KEY_LMS2XX, .required = true, .example = "/dev/ttyUSB0", DEVICE(port), .help = "Serial line. A name under /dev/serial/by-id/ stays the same over reboots."},
+	{GROUP_DEVICE, "baud", KEY_INTEGER, KEY_LMS2XX, .preset = "38400", .example = "500000", .choices = "9600|19200|38400|500000", DEVICE(baud), .help = "Rate to stream at; the rate the scanner has now is found. 500000 needs RS-422."},
+	{GROUP_DEVICE, "variant", KEY_VARIANT, KEY_LMS2XX, .preset = "180/0.5", .choices = "180/1|180/0.5|180/0.25|100/1|100/0.5|100/0.25", .help = "Field of view / resolution in degrees. 180/0.25 is made of partial scans."},
+	{GROUP_DEVICE, "unit", KEY_CHOICE, KEY_LMS2XX, .preset = "keep", .choices = "keep|mm|cm", DEVICE(range_unit), .help = "Unit of its ranges; keep: as the scanner is set. Changing it writes its memory, which wears."},
+	{GROUP_DEVICE, "mode", KEY_INTEGER, KEY_LMS2XX, .preset = "keep", .word = "keep", .word_value = -1, .choices = "0|1|2|3|4|5|6|15", DEVICE(mode), .help = "Measuring mode: how many bits are range (0-2: 13, 3-4: 14, 5-6: 15, 15: 16)."},
+	{GROUP_DEVICE, "range", KEY_PAIR, KEY_LMS2XX, .preset = "[0.05, 82]", .example = "[0.3, 30]", .dimension = DIMENSION_LENGTH, .min = 0, .max = 100, DEVICE(range_min_m), .help = "Beams outside are dropped and clear nothing."},
+	{GROUP_DEVICE, "mask", KEY_MASKS, KEY_LMS2XX, .preset = "[]", .dimension = DIMENSION_ANGLE, .min = DEG(-180), .max = DEG(180), .help = "Bearings left out, e.g. [[-90deg, -80deg]]: 0 is straight ahead, positive left."},
+	{GROUP_DEVICE, "tilt", KEY_TILT, KEY_LMS2XX, .preset = "0deg", .example = "servo", .dimension = DIMENSION_ANGLE, .min = DEG(-180), .max = DEG(180), .help = "The device that tilts this one, or the fixed angle at which it is mounted."},
+
+	{GROUP_DEVICE, "connect", KEY_TEXT, KEY_MODBUS, .required = true, .example = "/dev/ttyUSB1", DEVICE(connect), .help = "Serial line (RTU) or HOST:PORT (TCP)."},
+	{GROUP_DEVICE, "baud", KEY_INTEGER, KEY_MODBUS, .preset = "115200", .min = 1200, .max = 4000000, DEVICE(baud), .help = "Rate of the serial line."},
+	{GROUP_DEVICE, "parity", KEY_LETTER, KEY_MODBUS, .preset = "even", .choices = "none|even|odd", DEVICE(parity), .help = "Parity of the serial line; 8 data bits."},
+	{GROUP_DEVICE, "unit", KEY_INTEGER, KEY_MODBUS, .preset = "1", .min = 1, .max = 247, DEVICE(slave), .help = "Modbus unit id."},
+	{GROUP_DEVICE, "period", KEY_DURATION, KEY_MODBUS, .preset = "5ms", .dimension = DIMENSION_TIME, .min = 0, .max = 10, DEVICE(period_ns), .help = "Between two polls of the angle; 0: as fast as the answers come."},
+	{GROUP_DEVICE, "address_base", KEY_INTEGER, KEY_MODBUS, .preset = "0", .min = 0, .max = 1, DEVICE(address_base), .help = "1 where the device's handbook counts registers from 1."},
+	{GROUP_DEVICE, "position", KEY_REGISTER, KEY_MODBUS, .required = true, .example = "{function: 3, address: 0, type: i32, order: ABCD, scale: 0.001deg, zero: 0, sign: 1}", .inner = GROUP_REGISTER, DEVICE(position), .help = "Where the angle is read: angle = sign * scale * (raw - zero); positive looks down."},
+	{GROUP_DEVICE, "target", KEY_REGISTER, KEY_MODBUS, .example = "{function: 16, address: 2, type: i32, scale: 0.001deg}", .inner = GROUP_REGISTER, DEVICE(target), .help = "Where the wanted angle is written; needed for `sweep`."},
+	{GROUP_DEVICE, "speed", KEY_REGISTER, KEY_MODBUS, .example = "{function: 16, address: 4, type: u32, scale: 0.001deg/s}", .inner = GROUP_REGISTER, DEVICE(speed), .help = "Where the wanted speed is written."},
+	{GROUP_DEVICE, "write", KEY_WRITES, KEY_MODBUS, .preset = "[]", .inner = GROUP_WRITE, .help = "Registers written once at every start, in this order, e.g. [{address: 16, value: 1}]."},
+
+	{GROUP_DEVICE, "listen", KEY_TEXT, KEY_POSE, .example = "unix:/run/facetd/pose.sock", DEVICE(listen), .help = "Datagram socket for poses as JSON lines: unix:PATH or udp:HOST:PORT on loopback."},
+	{GROUP_DEVICE, "fixed", KEY_TRANSFORM, KEY_POSE, .inner = GROUP_FRAME, DEVICE(fixed_pose), .flag = offsetof(struct config_device, fixed), .help = "Instead of `listen`: the robot stands here, e.g. {xyz: [0, 0, 0], rpy: [0, 0, 90deg]}."},
+
+	{GROUP_REGISTER, "function", KEY_INTEGER, .preset = "auto", .word = "auto", .word_value = 0, .choices = "3|4|6|16", REGISTER_(function), .help = "Function code. Read: 3 holding, 4 input registers. Written: 6 single, 16 multiple. auto: 3 to read, 6 or 16 to write, by the type."},
+	{GROUP_REGISTER, "address", KEY_INTEGER, .required = true, .min = 0, .max = 65535, REGISTER_(address), .help = "First register."},
+	{GROUP_REGISTER, "type", KEY_CHOICE, .preset = "i16", .choices = "i16|u16|i32|u32|f32", REGISTER_(type), .help = "What it holds."},
+	{GROUP_REGISTER, "order", KEY_CHOICE, .preset = "ABCD", .choices = "ABCD|CDAB|BADC|DCBA", REGISTER_(order), .help = "Order of the bytes of 32 bits; A is the highest. For 16 bits B before A in BADC, DCBA."},
+	{GROUP_REGISTER, "scale", KEY_REAL, .required = true, .dimension = DIMENSION_RATE, .min = DEG(1e-6), .max = DEG(360), REGISTER_(scale), .help = "Angle (or angle per second) of one count, e.g. 0.001deg."},
+	{GROUP_REGISTER, "zero", KEY_REAL, .preset = "0", REGISTER_(zero), .help = "Raw value at angle 0."},
+	{GROUP_REGISTER, "sign", KEY_INTEGER, .preset = "1", .choices = "1|-1", REGISTER_(sign), .help = "-1 where the device counts up when the scanner looks up."},
+	{GROUP_WRITE, "address", KEY_INTEGER, .required = true, .min = 0, .max = 65535, .offset = 0, .size = 2, .help = "Register."},
+	{GROUP_WRITE, "value", KEY_INTEGER, .required = true, .min = 0, .max = 65535, .offset = 2, .size = 2, .help = "What is written there."},
+
+	{GROUP_SWEEP, "device", KEY_TEXT, .required = true, .example = "servo", CONFIG(sweep.device), .help = "The servo."},
+	{GROUP_SWEEP, "from", KEY_REAL, .preset = "-65deg", .dimension = DIMENSION_ANGLE, .min = DEG(-180), .max = DEG(180), CONFIG(sweep.from_rad), .help = "Upper end; positive looks down."},
+	{GROUP_SWEEP, "to", KEY_REAL, .preset = "45deg", .dimension = DIMENSION_ANGLE, .min = DEG(-180), .max = DEG(180), CONFIG(sweep.to_rad), .help = "Lower end."},
+	{GROUP_SWEEP, "speed", KEY_REAL, .preset = "30deg", .dimension = DIMENSION_RATE, .min = DEG(0.01), .max = DEG(1000), CONFIG(sweep.speed_rad_s), .help = "Per second. Rows lie speed / scan rate apart: 30deg/s at 37.5 Hz are 0.8 degree."},
+	{GROUP_SWEEP, "profile", KEY_CHOICE, .preset = "triangle", .choices = "triangle|sinus|step", CONFIG(sweep.profile), .help = "triangle: even speed; sinus: slower at the ends; step: stands for every profile."},
+	{GROUP_SWEEP, "step", KEY_REAL, .preset = "0.25deg", .dimension = DIMENSION_ANGLE, .min = DEG(0.001), .max = DEG(90), CONFIG(sweep.step_rad), .help = "Step of `profile: step`."},
+	{GROUP_SWEEP, "settle", KEY_DURATION, .preset = "100ms", .dimension = DIMENSION_TIME, .min = 0, .max = 60, CONFIG(sweep.settle_ns), .help = "How long the servo stands after a step."},
+	{GROUP_SWEEP, "rest", KEY_REAL, .dimension = DIMENSION_ANGLE, .min = DEG(-180), .max = DEG(180), CONFIG(sweep.rest_rad), .flag = offsetof(struct config, sweep.has_rest), .help = "Where it goes at the end, e.g. 0deg; left out: it stops where it is."},
+
+	{GROUP_LISTEN, "native", KEY_TEXTS, .preset = "[unix:/run/facetd/facetd.sock, tcp:127.0.0.1:7878]", CONFIG(listen.native), .help = "The native protocol and JSON lines: unix:PATH, tcp:HOST:PORT; at most 4. TCP on loopback only: from elsewhere use ssh -L."},
+	{GROUP_LISTEN, "group", KEY_TEXT, .preset = "facetd", CONFIG(listen.group), .help = "Group of the unix sockets (mode 0660). Where it does not exist or may not be given, they keep the daemon's own."},
+	{GROUP_LISTEN, "send_buffer", KEY_INTEGER, .preset = "0", .dimension = DIMENSION_BYTES, .min = 0, .max = 64 * MEGA, CONFIG(listen.send_buffer), .help = "The kernel's buffer to each client; 0: the system's own."},
+	{GROUP_LISTEN, "clients", KEY_INTEGER, .preset = "32", .min = 1, .max = 1024, CONFIG(listen.clients), .help = "At the limit the next one is told so and closed."},
+	{GROUP_LISTEN, "http", KEY_TEXT, .preset = "", .later = "the browser page and WebSockets", .help = "Where the viewer's page is served."},
+	{GROUP_LISTEN, "token_file", KEY_TEXT, .preset = "", .later = "the browser page and WebSockets", .help = "Who may change something from beyond loopback."},
+	{GROUP_LISTEN, "tls", KEY_TEXT, .preset = "", .later = "the browser page and WebSockets", .help = "Certificate and key."},
+
+	{GROUP_RECORD, "dir", KEY_TEXT, .preset = "", .later = "recording", .help = "Where recordings are written."},
+	{GROUP_RECORD, "chunk", KEY_DURATION, .preset = "1s", .dimension = DIMENSION_TIME, .min = 0.01, .max = 60, .later = "recording", .help = "What a cut file may lose."},
+	{GROUP_RECORD, "max_size", KEY_TEXT, .preset = "", .later = "recording", .help = "Size at which a new file is begun."},
+	{GROUP_RECORD, "max_age", KEY_TEXT, .preset = "", .later = "recording", .help = "Age at which a new file is begun."},
+	{GROUP_RECORD, "messages", KEY_SWITCH, .preset = "off", .later = "recording", .help = "Record what is published, too."},
+	{GROUP_STATE, "file", KEY_TEXT, .preset = "", .later = "keeping the map over restarts", .help = "Where the map is kept."},
+	{GROUP_STATE, "checkpoint", KEY_DURATION, .preset = "5min", .dimension = DIMENSION_TIME, .min = 1, .max = 86400, .later = "keeping the map over restarts", .help = "How often."},
+	{0}
+};
+/* clang-format on */
+
+static const char *const driver_names[] = {"lms2xx", "modbus", "pose", NULL};
+
+unsigned keys_driver(const char *name)
+{
+	for (unsigned i = 0; driver_names[i]; i++)
+		if (strcmp(driver_names[i], name) == 0)
+			return 1u << i;
+	return 0;
+}
+
+const char *keys_driver_name(unsigned bit)
+{
+	for (unsigned i = 0; driver_names[i]; i++)
+		if (bit & 1u << i)
+			return driver_names[i];
+	return "";
+}
+
+static bool belongs(const struct key *key, enum key_group group, unsigned drivers)
+{
+	return key->group == group && (!drivers || !key->drivers || (key->drivers & drivers));
+}
+
+const struct key *keys_find(enum key_group group, const char *name, unsigned drivers)
+{
+	for (const struct key *key = key_table; key->name; key++)
+		if (belongs(key, group, drivers) && strcmp(key->name, name) == 0)
+			return key;
+	return NULL;
+}
+
+const struct key *keys_nearest(enum key_group group, const char *name, unsigned drivers)
+{
+	const struct key *best = NULL;
+	int best_distance = 0;
+	for (const struct key *key = key_table; key->name; key++) {
+		if (!belongs(key, group, drivers))
+			continue;
+		const int distance = keys_distance(key->name, name);
+		if (!best || distance < best_distance) {
+			best = key;
+			best_distance = distance;
+		}
+	}
+	return best;
+}
+
+static int least(int a, int b, int c)
+{
+	const int ab = a < b ? a : b;
+	return ab < c ? ab : c;
+}
+
+/* Three rows of the usual table: the row before last is what a swap of neighbours reaches back to. */
+int keys_distance(const char *a, const char *b)
+{
+	enum { LETTERS = 63 };
+	int row[3][LETTERS + 1] = {0};
+	const int na = (int)strnlen(a, LETTERS), nb = (int)strnlen(b, LETTERS);
+	int *before = row[0], *last = row[1], *now = row[2];
+	for (int j = 0; j <= nb; j++)
+		last[j] = j;
+	for (int i = 1; i <= na; i++) {
+		now[0] = i;
+		for (int j = 1; j <= nb; j++) {
+			now[j] = least(last[j] + 1, now[j - 1] + 1, last[j - 1] + (a[i - 1] != b[j - 1]));
+			if (i > 1 && j > 1 && a[i - 1] == b[j - 2] && a[i - 2] == b[j - 1] &&
+			    before[j - 2] + 1 < now[j])
+				now[j] = before[j - 2] + 1;
+		}
+		int *const free_row = before;
+		before = last;
+		last = now;
+		now = free_row;
+	}
+	return last[nb];
+}
+
+static void print_choices(const struct key *key, char *ret, size_t cap)
+{
+	size_t n = (size_t)snprintf(ret, cap, "one of %s%s", key->word ? key->word : "", key->word ? ", " : "");
+	for (const char *c = key->choices; *c && n + 3 < cap; c++) {
+		ret[n++] = *c == '|' ? ',' : *c;
+		if (*c == '|')
+			ret[n++] = ' ';
+	}
+	ret[n] = '\0';
+}
+
+void keys_print_range(const struct key *key, char *ret, size_t cap)
+{
+	char min[32], max[32];
+	ret[0] = '\0';
+	if (key->type == KEY_SWITCH) {
+		snprintf(ret, cap, "on or off");
+	} else if (key->choices) {
+		print_choices(key, ret, cap);
+	} else if (key->min != 0 || key->max != 0) {
+		units_print(key->min, key->dimension, min, sizeof(min));
+		units_print(key->max, key->dimension, max, sizeof(max));
+		snprintf(ret, cap, "%s .. %s", min, max);
+	}
+}

@@ -1,10 +1,10 @@
 /* The whole system on one screen: how a reading becomes rows of the map (design, section 1).
  *
- *   pipeline_handle   a record goes to its device's decoder;
- *   on_profile        what the decoder finds goes to the assemblers that need it: a profile to its scanner's, an angle
- * to on_tilt           those of the scanners which that device tilts, a pose to all; on_pose advance           every
- * assembler hands out the rows that are complete at this record's log time; hand_out          a row gets its number and
- * goes to the sink: the worker's queue, or a map.
+ *   pipeline_handle              a record goes to its device's decoder;
+ *   on_profile, on_tilt, on_pose what the decoder finds goes to the assemblers that need it: a profile to its scanner's,
+ *                                an angle to those of the scanners which that device tilts, a pose to all;
+ *   advance                      every assembler hands out the rows that are complete at this record's log time;
+ *   hand_out                     a row gets its number and goes to the sink: the worker's queue, or a map.
  *
  * Nothing here looks at a clock. What changes the map hangs on records and ticks alone, so a kept list of them gives
  * the same rows again (law L7); the only thing a replay must be told besides is which rows the sink had refused. That

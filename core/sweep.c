@@ -1,0 +1,632 @@
+/* Sweep assembly (design 1.2; protocols A.9, E): profiles wait in a ring until samples of the tilt and of the pose frame them,
+ * then become rows; every beam is placed with the tilt and the pose of its own time.
+ *
+ *   p_map = P(t) . B . Ry(theta(t)) . L . (r cos b, r sin b, 0)      P map <- base, B base <- tilt axis, L tilt <- laser
+ *
+ * Turns. A mirror turns at 75 Hz and measures a raster of 1 degree; finer ones take 2 or 4 turns, interlaced: beam k of the
+ * profile belongs to turn k mod 2 (4). A servo that moves is at another angle in each turn, so each turn is a row of its own,
+ * with its own first bearing. Where the servo stood they are one row again, since neighbours then are 0.5 degree apart,
+ * not 1, and no two rows lie upon each other. Partial scans arrive a turn at a time, and are rows as they are.
+ *
+ * Waiting. `hold` is judged when the next record is handled, by its log time (law L7). When it is over, the tilt goes on in a
+ * line for 1.5 of its periods, the pose for 50 ms with its last twist; a row with a beam beyond that is dropped whole:
+ * half a row would look like free space next to a wall. Before the first sample there is nothing to go on from.
+ *
+ * Sweeps. Rows between two turns of the servo are one raster. Noise must not make turns: the angle has to come back by more
+ * than TURN_RAD from its extreme. A jump (a fly-back, a robot that went on while rows were dropped) also cuts the raster: no
+ * surface may be spanned between rows that were not measured next to each other. After a cut the direction is unknown, so
+ * that a fly-back counts once.
+ *
+ * The samples live in rings of fixed size, old ones give way; a sample not newer than the last is ignored, unless it is
+ * older by seconds: then the device's time was set back and its ring begins anew. */
+#include "core/sweep.h"
+
+#include <assert.h>
+#include <stddef.h>
+#include <stdlib.h>
+#include <string.h>
+
+#include "core/trig.h"
+
+#define RING                1024         /* samples, a power of two: 1 s at 1 kHz */
+#define SET_BACK_NS         2000000000LL /* older by more than this: time was set back */
+#define POSE_EXTRAPOLATE_NS 50000000LL
+#define TWIST_BASE_NS       5000000LL    /* the two poses of a twist are at least so far apart ... */
+#define TWIST_OLDEST_NS     1000000000LL /* ... and no farther than this */
+#define PERIODS             9            /* intervals whose median is the tilt's sample period */
+#define STOOD_RAD           (0.02 * TRIG_DEG)
+#define TURN_RAD            (0.1 * TRIG_DEG)
+#define CUT_RAD             (5 * TRIG_DEG) /* between neighbouring rows of one raster */
+#define CUT_M               0.5
+#define SWEEP_ROWS_MAX      2048
+#define MIXED_JUMP_M        0.2f
+#define MIXED_LINE_M        0.02
+
+struct held {
+	struct profile profile;
+	int64_t log_ns;
+};
+
+struct sweep {
+	struct sweep_params params;
+	struct held *held; /* ring of SWEEP_PROFILES_WAITING_MAX */
+	uint32_t head, waiting;
+	int turn, turns; /* of the profile at the head: next row, and how many; turns 0: not judged yet */
+	uint64_t lost;   /* rows lost with profiles that found the ring full, not reported yet */
+
+	struct tilt *tilt; /* ring of RING; number i lives at i % RING */
+	struct pose *pose;
+	uint64_t tilt_begin, tilt_end, pose_begin, pose_end;
+
+	/* Sine and cosine of the bearings of the last fan. */
+	double fan_first_rad, fan_step_rad;
+	uint32_t fan_n;
+	double (*fan)[2];
+
+	/* The raster so far. */
+	bool started;
+	int direction;
+	double extreme_rad, last_rad;
+	struct vec3 last_origin;
+	uint32_t sweep_rows;
+
+	struct sweep_stats stats;
+};
+
+struct sweep *sweep_create(const struct sweep_params *params)
+{
+	struct sweep *s = calloc(1, sizeof *s);
+	if (!s)
+		return NULL;
+	s->params = *params;
+	s->held = malloc(SWEEP_PROFILES_WAITING_MAX * sizeof *s->held);
+	s->tilt = malloc(RING * sizeof *s->tilt);
+	s->pose = malloc(RING * sizeof *s->pose);
+	s->fan = malloc(PROFILE_BEAMS_MAX * sizeof *s->fan);
+	if (!s->held || !s->tilt || !s->pose || !s->fan) {
+		sweep_destroy(s);
+		return NULL;
+	}
+	return s;
+}
+
+void sweep_destroy(struct sweep *s)
+{
+	if (!s)
+		return;
+	free(s->held);
+	free(s->tilt);
+	free(s->pose);
+	free(s->fan);
+	free(s);
+}
+
+void sweep_stats(const struct sweep *s, struct sweep_stats *ret)
+{
+	*ret = s->stats;
+}
+
+const char *sweep_drop_name(enum sweep_drop drop)
+{
+	static const char *const names[SWEEP_DROPS] = {"no tilt", "stale tilt", "no pose", "stale pose",
+	                                               "too many profiles waiting"};
+	return drop < SWEEP_DROPS ? names[drop] : "unknown";
+}
+
+static struct held *held_head(const struct sweep *s)
+{
+	return &s->held[s->head % SWEEP_PROFILES_WAITING_MAX];
+}
+
+static void held_pop(struct sweep *s)
+{
+	s->head++;
+	s->waiting--;
+	s->turn = s->turns = 0;
+}
+
+static int interlace_of(const struct profile *p)
+{
+	return p->interlace > 1 ? (p->interlace < p->n ? p->interlace : p->n) : 1;
+}
+
+void sweep_profile(struct sweep *s, const struct profile *p, int64_t log_ns)
+{
+	assert(p->n <= PROFILE_BEAMS_MAX);
+	s->stats.profiles++;
+	if (p->n == 0)
+		return;
+	if (s->waiting == SWEEP_PROFILES_WAITING_MAX) {
+		int rows = s->turns ? s->turns : interlace_of(&held_head(s)->profile);
+		s->lost += (uint64_t)(rows - s->turn);
+		held_pop(s);
+	}
+	struct held *held = &s->held[(s->head + s->waiting++) % SWEEP_PROFILES_WAITING_MAX];
+	size_t n = p->n;
+	memcpy(&held->profile, p, offsetof(struct profile, range_m));
+	memcpy(held->profile.range_m, p->range_m, n * sizeof *p->range_m);
+	memcpy(held->profile.state, p->state, n * sizeof *p->state);
+	held->log_ns = log_ns;
+}
+
+/* Makes room for a sample at `t_ns` in a ring whose newest is `newest_ns`; false where it is to be ignored. */
+static bool ring_admit(uint64_t *begin, uint64_t *end, int64_t newest_ns, int64_t t_ns)
+{
+	if (*end > *begin && t_ns <= newest_ns) {
+		if (newest_ns - t_ns < SET_BACK_NS)
+			return false;
+		*begin = *end;
+	}
+	if (*end - *begin == RING)
+		++*begin;
+	return true;
+}
+
+static const struct tilt *tilt_at(const struct sweep *s, uint64_t i)
+{
+	return &s->tilt[i % RING];
+}
+
+static const struct pose *pose_at(const struct sweep *s, uint64_t i)
+{
+	return &s->pose[i % RING];
+}
+
+void sweep_tilt(struct sweep *s, const struct tilt *sample)
+{
+	int64_t newest_ns = s->tilt_end > s->tilt_begin ? tilt_at(s, s->tilt_end - 1)->t_ns : 0;
+	if (ring_admit(&s->tilt_begin, &s->tilt_end, newest_ns, sample->t_ns))
+		s->tilt[s->tilt_end++ % RING] = *sample;
+}
+
+void sweep_pose(struct sweep *s, const struct pose *sample)
+{
+	int64_t newest_ns = s->pose_end > s->pose_begin ? pose_at(s, s->pose_end - 1)->t_ns : 0;
+	if (ring_admit(&s->pose_begin, &s->pose_end, newest_ns, sample->t_ns))
+		s->pose[s->pose_end++ % RING] = *sample;
+}
+
+/* The number of the first sample later than t_ns. */
+static uint64_t tilt_after(const struct sweep *s, int64_t t_ns)
+{
+	uint64_t low = s->tilt_begin, high = s->tilt_end;
+	while (low < high) {
+		uint64_t middle = low + (high - low) / 2;
+		if (tilt_at(s, middle)->t_ns > t_ns)
+			high = middle;
+		else
+			low = middle + 1;
+	}
+	return low;
+}
+
+static uint64_t pose_after(const struct sweep *s, int64_t t_ns)
+{
+	uint64_t low = s->pose_begin, high = s->pose_end;
+	while (low < high) {
+		uint64_t middle = low + (high - low) / 2;
+		if (pose_at(s, middle)->t_ns > t_ns)
+			high = middle;
+		else
+			low = middle + 1;
+	}
+	return low;
+}
+
+/* Median of the newest intervals between tilt samples: neither a pause nor a burst moves it. */
+static int64_t tilt_period_ns(const struct sweep *s)
+{
+	int64_t interval[PERIODS];
+	int n = 0;
+	for (uint64_t i = s->tilt_end; n < PERIODS && i > s->tilt_begin + 1; i--, n++) {
+		int64_t value = tilt_at(s, i - 1)->t_ns - tilt_at(s, i - 2)->t_ns;
+		int k = n;
+		for (; k > 0 && interval[k - 1] > value; k--)
+			interval[k] = interval[k - 1];
+		interval[k] = value;
+	}
+	return n ? interval[n / 2] : 0;
+}
+
+/* What surrounds the beams of a row: a walk through the rings, times never decreasing. */
+struct walk {
+	const struct sweep *s;
+	uint64_t tilt_next, pose_next; /* first samples later than the time asked for last */
+	int64_t tilt_limit_ns;         /* beyond the last tilt sample up to here */
+	double angle_rad, sine, cosine;
+	bool has_angle;
+	struct transform map_base;
+};
+
+static void walk_init(struct walk *w, const struct sweep *s, int64_t t_ns)
+{
+	*w = (struct walk){.s = s, .tilt_next = tilt_after(s, t_ns), .pose_next = pose_after(s, t_ns)};
+	w->tilt_limit_ns = tilt_period_ns(s) * 3 / 2;
+	w->map_base = s->params.map_base;
+}
+
+/* 0, or 1 + enum sweep_drop. */
+static int walk_tilt(struct walk *w, int64_t t_ns, double *ret_rad)
+{
+	const struct sweep *s = w->s;
+	if (s->params.fixed_tilt) {
+		*ret_rad = s->params.tilt_rad;
+		return 0;
+	}
+	while (w->tilt_next < s->tilt_end && tilt_at(s, w->tilt_next)->t_ns <= t_ns)
+		w->tilt_next++;
+	if (w->tilt_next == s->tilt_begin)
+		return 1 + SWEEP_NO_TILT;
+	const struct tilt *before = tilt_at(s, w->tilt_next - 1), *after;
+	if (before->t_ns == t_ns) {
+		*ret_rad = before->angle_rad;
+		return 0;
+	}
+	if (w->tilt_next == s->tilt_end) {
+		if (t_ns - before->t_ns > w->tilt_limit_ns)
+			return 1 + SWEEP_STALE_TILT;
+		after = before; /* go on along the last interval; there is one, or the limit were 0 */
+		before = tilt_at(s, w->tilt_next - 2);
+	} else {
+		after = tilt_at(s, w->tilt_next);
+	}
+	double share = (double)(t_ns - before->t_ns) / (double)(after->t_ns - before->t_ns);
+	*ret_rad = before->angle_rad + (after->angle_rad - before->angle_rad) * share;
+	return 0;
+}
+
+static struct transform pose_between(const struct pose *a, const struct pose *b, int64_t t_ns)
+{
+	double share = (double)(t_ns - a->t_ns) / (double)(b->t_ns - a->t_ns);
+	return transform_quat(vec3_lerp(a->position_m, b->position_m, share),
+	                      quat_between(a->rotation, b->rotation, share));
+}
+
+static bool pose_equal(const struct pose *a, const struct pose *b)
+{
+	const struct quat *p = &a->rotation, *q = &b->rotation;
+	return a->position_m.x == b->position_m.x && a->position_m.y == b->position_m.y &&
+	       a->position_m.z == b->position_m.z && p->w == q->w && p->x == q->x && p->y == q->y && p->z == q->z;
+}
+
+/* The last pose, moved on with the twist from an earlier one. */
+static struct transform pose_beyond(const struct sweep *s, int64_t t_ns)
+{
+	const struct pose *last = pose_at(s, s->pose_end - 1);
+	for (uint64_t i = s->pose_end - 1; i > s->pose_begin; i--) {
+		const struct pose *earlier = pose_at(s, i - 1);
+		int64_t apart_ns = last->t_ns - earlier->t_ns;
+		if (apart_ns > TWIST_OLDEST_NS)
+			break;
+		if (apart_ns >= TWIST_BASE_NS)
+			return pose_between(earlier, last, t_ns);
+	}
+	return transform_quat(last->position_m, last->rotation);
+}
+
+/* Sets w->map_base to the pose at t_ns. 0, or 1 + enum sweep_drop. */
+static int walk_pose(struct walk *w, int64_t t_ns)
+{
+	const struct sweep *s = w->s;
+	if (s->params.fixed_pose)
+		return 0;
+	while (w->pose_next < s->pose_end && pose_at(s, w->pose_next)->t_ns <= t_ns)
+		w->pose_next++;
+	if (w->pose_next == s->pose_begin)
+		return 1 + SWEEP_NO_POSE;
+	const struct pose *before = pose_at(s, w->pose_next - 1);
+	if (w->pose_next == s->pose_end) {
+		if (t_ns - before->t_ns > POSE_EXTRAPOLATE_NS)
+			return 1 + SWEEP_STALE_POSE;
+		w->map_base = pose_beyond(s, t_ns);
+		return 0;
+	}
+	const struct pose *after = pose_at(s, w->pose_next);
+	w->map_base = pose_equal(before, after) ? transform_quat(before->position_m, before->rotation)
+	                                        : pose_between(before, after, t_ns);
+	return 0;
+}
+
+static struct vec3 turn_about_y(const struct walk *w, struct vec3 p)
+{
+	return (struct vec3){w->cosine * p.x + w->sine * p.z, p.y, w->cosine * p.z - w->sine * p.x};
+}
+
+static bool in_box(const struct sweep_params *params, struct vec3 p)
+{
+	const struct vec3 *a = &params->box_min, *b = &params->box_max;
+	return p.x >= a->x && p.x <= b->x && p.y >= a->y && p.y <= b->y && p.z >= a->z && p.z <= b->z;
+}
+
+/* Places one beam of bearing (cosine, sine). 0, or 1 + enum sweep_drop. */
+static int place_beam(struct walk *w, int64_t t_ns, const double bearing[2], struct row_beam *beam)
+{
+	const struct sweep_params *params = &w->s->params;
+	double angle;
+	int r = walk_tilt(w, t_ns, &angle);
+	if (r == 0)
+		r = walk_pose(w, t_ns);
+	if (r)
+		return r;
+	if (!w->has_angle || angle != w->angle_rad) {
+		w->has_angle = true;
+		w->angle_rad = angle;
+		w->sine = trig_sin(angle);
+		w->cosine = trig_cos(angle);
+	}
+	struct vec3 origin = transform_point(&params->base_tilt, turn_about_y(w, params->tilt_laser.t));
+	beam->origin = transform_point(&w->map_base, origin);
+	beam->point = beam->origin;
+	if (beam->state != BEAM_OK)
+		return 0;
+	struct vec3 reach = {bearing[0] * (double)beam->range_m, bearing[1] * (double)beam->range_m, 0};
+	struct vec3 tilted = turn_about_y(w, transform_point(&params->tilt_laser, reach));
+	struct vec3 point = transform_point(&params->base_tilt, tilted);
+	if (params->has_box && in_box(params, point))
+		beam->state = BEAM_SELF;
+	else
+		beam->point = transform_point(&w->map_base, point);
+	return 0;
+}
+
+static int64_t beam_time_ns(const struct profile *p, int interlace, uint32_t k)
+{
+	return p->t_ns + (int64_t)(k % (uint32_t)interlace) * p->turn_ns +
+	       (int64_t)(k / (uint32_t)interlace) * p->beam_ns;
+}
+
+static int64_t last_beam_ns(const struct profile *p)
+{
+	int interlace = interlace_of(p);
+	int64_t last = p->t_ns;
+	for (int i = 0; i < interlace; i++) {
+		int64_t t = beam_time_ns(p, interlace, (uint32_t)(p->n - 1 - i));
+		last = t > last ? t : last;
+	}
+	return last;
+}
+
+static bool samples_reach(const struct sweep *s, int64_t t_ns)
+{
+	bool tilt = s->params.fixed_tilt || (s->tilt_end > s->tilt_begin && tilt_at(s, s->tilt_end - 1)->t_ns >= t_ns);
+	bool pose = s->params.fixed_pose || (s->pose_end > s->pose_begin && pose_at(s, s->pose_end - 1)->t_ns >= t_ns);
+	return tilt && pose;
+}
+
+/* From the last sample not after the first beam to the first not before the last beam. */
+static bool servo_stood(const struct sweep *s, int64_t first_ns, int64_t last_ns)
+{
+	if (s->params.fixed_tilt)
+		return true;
+	uint64_t i = tilt_after(s, first_ns);
+	if (i == s->tilt_begin)
+		return false;
+	double low = tilt_at(s, --i)->angle_rad, high = low;
+	for (; i < s->tilt_end; i++) {
+		double angle = tilt_at(s, i)->angle_rad;
+		low = angle < low ? angle : low;
+		high = angle > high ? angle : high;
+		if (tilt_at(s, i)->t_ns >= last_ns)
+			break;
+	}
+	return high - low <= STOOD_RAD;
+}
+
+static void fan_prepare(struct sweep *s, const struct profile *p)
+{
+	if (s->fan_n >= p->n && s->fan_first_rad == p->first_rad && s->fan_step_rad == p->step_rad)
+		return;
+	for (uint32_t k = 0; k < p->n; k++) {
+		double bearing = p->first_rad + k * p->step_rad;
+		s->fan[k][0] = trig_cos(bearing);
+		s->fan[k][1] = trig_sin(bearing);
+	}
+	s->fan_n = p->n;
+	s->fan_first_rad = p->first_rad;
+	s->fan_step_rad = p->step_rad;
+}
+
+static bool is_masked(const struct sweep_params *params, double bearing_rad)
+{
+	for (int i = 0; i < params->masks; i++)
+		if (bearing_rad >= params->mask[i].from_rad - 1e-9 && bearing_rad <= params->mask[i].to_rad + 1e-9)
+			return true;
+	return false;
+}
+
+/* Judges the beams of a row by range, mask and neighbours; ranges and states first lie in `range_m`, `state`. */
+static void judge_beams(const struct sweep_params *params, struct row *row, float *range_m, uint8_t *state)
+{
+	/* As floats: a reading of exactly the limit, rounded to a float, is within it. */
+	float low = (float)params->range_min_m, high = (float)params->range_max_m;
+	for (uint32_t i = 0; i < row->n; i++) {
+		if (state[i] != BEAM_OK)
+			continue;
+		if (!(range_m[i] >= low && range_m[i] <= high))
+			state[i] = BEAM_OUT_OF_RANGE;
+		else if (params->masks && is_masked(params, row->first_rad + i * row->step_rad))
+			state[i] = BEAM_MASKED;
+	}
+	sweep_mark_mixed(range_m, state, row->n, row->first_rad, row->step_rad);
+	for (uint32_t i = 0; i < row->n; i++) {
+		row->beam[i].range_m = range_m[i];
+		row->beam[i].state = state[i];
+	}
+}
+
+/* Which beams of a profile make a row: k = first, first + stride, ... */
+struct pick {
+	uint32_t first, stride, n;
+};
+
+static void copy_beams(const struct sweep_params *params, const struct profile *p, struct pick pick, struct row *row)
+{
+	float range_m[PROFILE_BEAMS_MAX];
+	uint8_t state[PROFILE_BEAMS_MAX];
+	for (uint32_t i = 0; i < pick.n; i++) {
+		range_m[i] = p->range_m[pick.first + i * pick.stride];
+		state[i] = p->state[pick.first + i * pick.stride];
+	}
+	judge_beams(params, row, range_m, state);
+}
+
+/* Places the beams of one turn of the mirror; `pick` says which beams of the profile the row holds. */
+static int place_turn(const struct sweep *s, const struct profile *p, int turn, struct pick pick, struct row *row)
+{
+	int interlace = interlace_of(p);
+	struct walk walk;
+	walk_init(&walk, s, beam_time_ns(p, interlace, (uint32_t)turn));
+	for (uint32_t k = (uint32_t)turn; k < p->n; k += (uint32_t)interlace) {
+		struct row_beam *beam = &row->beam[(k - pick.first) / pick.stride];
+		int r = place_beam(&walk, beam_time_ns(p, interlace, k), s->fan[k], beam);
+		if (r)
+			return r;
+		if ((k - pick.first) / pick.stride == pick.n / 2)
+			row->tilt_rad = walk.angle_rad;
+	}
+	return 0;
+}
+
+/* Does this row begin a sweep? Keeps the servo's direction. */
+static bool turn_seen(struct sweep *s, const struct row *row)
+{
+	double angle = row->tilt_rad, back = s->direction * (s->extreme_rad - angle);
+	struct vec3 moved = vec3_sub(row->beam[0].origin, s->last_origin);
+	bool cut = !s->started || fabs(angle - s->last_rad) > CUT_RAD || vec3_norm(moved) > CUT_M ||
+	           s->sweep_rows >= SWEEP_ROWS_MAX || (s->direction && back > TURN_RAD);
+	if (cut) {
+		s->direction = 0;
+		s->extreme_rad = angle;
+		s->sweep_rows = 0;
+	} else if (s->direction == 0) {
+		if (fabs(angle - s->extreme_rad) > TURN_RAD) {
+			s->direction = angle > s->extreme_rad ? 1 : -1;
+			s->extreme_rad = angle;
+		}
+	} else if (back < 0) {
+		s->extreme_rad = angle;
+	}
+	s->started = true;
+	s->last_rad = angle;
+	s->last_origin = row->beam[0].origin;
+	s->sweep_rows++;
+	return cut;
+}
+
+static void count_row(struct sweep *s, const struct row *row)
+{
+	s->stats.rows++;
+	s->stats.sweeps += row->starts_sweep;
+	for (uint32_t i = 0; i < row->n; i++)
+		s->stats.beams[row->beam[i].state]++;
+}
+
+/* The row `turn` of `turns` of a profile. 0, -1 without memory, or 1 + enum sweep_drop. */
+static int make_row(struct sweep *s, const struct profile *p, int turn, int turns, struct row **ret)
+{
+	uint32_t first = (uint32_t)turn, stride = (uint32_t)turns;
+	struct pick pick = {first, stride, (p->n - first + stride - 1) / stride};
+	int interlace = interlace_of(p), r = 0;
+	struct row *row = row_create(pick.n);
+	if (!row)
+		return -1;
+	row->raster = s->params.raster;
+	row->t_ns = beam_time_ns(p, interlace, first);
+	row->first_rad = p->first_rad + turn * p->step_rad;
+	row->step_rad = p->step_rad * turns;
+	copy_beams(&s->params, p, pick, row);
+	fan_prepare(s, p);
+	/* A row of all turns (the servo stood) is placed turn by turn, so that times only rise. */
+	for (int i = turn; r == 0 && i < interlace; i += turns)
+		r = place_turn(s, p, i, pick, row);
+	if (r) {
+		row_destroy(row);
+		return r;
+	}
+	row->starts_sweep = turn_seen(s, row);
+	count_row(s, row);
+	*ret = row;
+	return 0;
+}
+
+static enum sweep_verdict dropped(struct sweep *s, enum sweep_drop drop, enum sweep_drop *ret_drop)
+{
+	s->stats.dropped[drop]++;
+	*ret_drop = drop;
+	return SWEEP_DROPPED;
+}
+
+enum sweep_verdict sweep_next(struct sweep *s, int64_t log_ns, bool end, struct row **ret_row,
+                              enum sweep_drop *ret_drop)
+{
+	if (s->lost > 0) {
+		s->lost--;
+		return dropped(s, SWEEP_OVERFLOW, ret_drop);
+	}
+	if (s->waiting == 0)
+		return SWEEP_WAIT;
+	struct held *held = held_head(s);
+	const struct profile *p = &held->profile;
+	if (s->turns == 0) {
+		int64_t last_ns = last_beam_ns(p);
+		if (!end && !samples_reach(s, last_ns) && log_ns - held->log_ns < s->params.hold_ns)
+			return SWEEP_WAIT;
+		s->turns = servo_stood(s, p->t_ns, last_ns) ? 1 : interlace_of(p);
+	}
+	struct row *row = NULL;
+	int r = make_row(s, p, s->turn, s->turns, &row);
+	if (r < 0)
+		return SWEEP_NOMEM;
+	if (++s->turn == s->turns)
+		held_pop(s);
+	if (r > 0)
+		return dropped(s, (enum sweep_drop)(r - 1), ret_drop);
+	row->ends_sweep = end && s->waiting == 0;
+	*ret_row = row;
+	return SWEEP_ROW;
+}
+
+static bool is_valid(uint8_t state)
+{
+	return state == BEAM_OK || state == BEAM_MIXED; /* BEAM_MIXED here: was BEAM_OK before this pass */
+}
+
+/* Do beams first .. first + 3 lie within 2 cm of the line through the outer two? Place of a beam in the plane of the fan. */
+static bool on_line(const float *range_m, uint32_t first, double step_rad)
+{
+	double x[4], y[4];
+	for (uint32_t i = 0; i < 4; i++) {
+		double bearing = i * step_rad; /* where the fan begins does not matter to a line */
+		x[i] = (double)range_m[first + i] * trig_cos(bearing);
+		y[i] = (double)range_m[first + i] * trig_sin(bearing);
+	}
+	double dx = x[3] - x[0], dy = y[3] - y[0], length = sqrt(dx * dx + dy * dy);
+	for (int i = 1; i < 3; i++)
+		if (fabs(dx * (y[i] - y[0]) - dy * (x[i] - x[0])) > MIXED_LINE_M * length)
+			return false;
+	return true;
+}
+
+/* One surface, seen at a slant: the range runs one way through i, and a fourth neighbour is on the line too. */
+static bool is_slanted(const float *range_m, const uint8_t *state, uint32_t n, uint32_t i, double step_rad)
+{
+	bool rises = range_m[i - 1] < range_m[i] && range_m[i] < range_m[i + 1];
+	bool falls = range_m[i - 1] > range_m[i] && range_m[i] > range_m[i + 1];
+	if (!rises && !falls)
+		return false;
+	return (i >= 2 && is_valid(state[i - 2]) && on_line(range_m, i - 2, step_rad)) ||
+	       (i + 2 < n && is_valid(state[i + 2]) && on_line(range_m, i - 1, step_rad));
+}
+
+void sweep_mark_mixed(const float *range_m, uint8_t *state, uint32_t n, double first_rad, double step_rad)
+{
+	(void)first_rad;
+	for (uint32_t i = 1; i + 1 < n; i++) {
+		if (state[i] != BEAM_OK || !is_valid(state[i - 1]) || !is_valid(state[i + 1]))
+			continue;
+		bool jumps = fabsf(range_m[i] - range_m[i - 1]) > MIXED_JUMP_M &&
+		             fabsf(range_m[i] - range_m[i + 1]) > MIXED_JUMP_M;
+		if (jumps && !is_slanted(range_m, state, n, i, step_rad))
+			state[i] = BEAM_MIXED;
+	}
+}

@@ -1,0 +1,11 @@
+/* The commands of `facet`: each takes the rest of the command line, argv[0] being "facet NAME", and answers with the exit
+ * status: 0, 1 bad input, 2 bad usage. */
+#ifndef FACET_TOOLS_COMMANDS_H
+#define FACET_TOOLS_COMMANDS_H
+
+int reconstruct_main(int argc, char **argv);
+int watch_main(int argc, char **argv);
+int save_main(int argc, char **argv);
+int simulate_main(int argc, char **argv);
+
+#endif

@@ -26,7 +26,7 @@ void model_finish(struct model *);
 struct buffer {
 	uint8_t *data;
 	size_t len, cap;
-	int error; /* 0 or -ENOMEM */
+	int error; /* 0, -ENOMEM, or -EFBIG: more than the format can hold (4 GB of .glb) */
 };
 void buffer_append(struct buffer *, const void *data, size_t len);
 void buffer_printf(struct buffer *, const char *format, ...) __attribute__((format(printf, 2, 3)));

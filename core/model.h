@@ -56,7 +56,11 @@ int pcd_read(const uint8_t *data, size_t len, struct cloud *ret, struct parse_er
 int xyz_read(const uint8_t *data, size_t len, struct cloud *ret, struct parse_error *error); /* .xyz; .pts with a count line */
 
 /* uos .3d: rows of a raster where one can be recovered (else the file is a cloud). Ranges and bearings as the scanner
- * had them, so that the rows go the way of live ones; see uos.c for the frames. */
+ * had them, so that the rows go the way of live ones; see uos.c for the frames. Ranges outside these limits keep their
+ * value and are BEAM_OUT_OF_RANGE; SICK's error codes are states, their range (32.759 .. 32.767 m) is kept too; a beam
+ * the file has no point for is BEAM_NO_ECHO with range 0. */
+#define UOS_RANGE_MIN_M 0.3
+#define UOS_RANGE_MAX_M 30.0
 struct uos_scan {
 	uint32_t rows;
 	struct uos_row {

@@ -14,7 +14,7 @@
  *
  * Ranges are rounded to whole millimetres when nearly all of them are whole within what the file's digits can say. Old
  * converters wrote SICK's error codes as ranges (3276.7 cm is 0x7FFF, "no valid value"): they become beam states again.
- * Ranges too short or too long to be used stay as the scanner gave them; the assembler judges them like live ones. */
+ * Ranges below 0.30 m (the robot) or beyond 30 m keep their value and are marked out of range. */
 #include <errno.h>
 #include <math.h>
 #include <stdio.h>
@@ -204,6 +204,12 @@ static bool is_code(double mm)
 	return whole >= CODE_FIRST_MM && whole <= CODE_LAST_MM && fabs(mm - whole) < 0.35;
 }
 
+/* Of the number as it stands in the file: 29.9999 cm is too short, though its millimetres round to 300. */
+static bool in_range(double mm)
+{
+	return mm >= UOS_RANGE_MIN_M * 1000 && mm <= UOS_RANGE_MAX_M * 1000;
+}
+
 static void row_init(struct uos_row *row, const struct raster *raster)
 {
 	row->first_rad = raster->first * RASTER_RAD - TRIG_PI / 2;
@@ -241,7 +247,7 @@ static size_t fill_row(const struct points *p, size_t begin, size_t end, const s
 			continue;
 		}
 		row->range_m[cell] = (float)((millimetres ? rint(mm) : mm) / 1000);
-		row->state[cell] = is_code(mm) ? code_state(rint(mm)) : BEAM_OK;
+		row->state[cell] = is_code(mm) ? code_state(rint(mm)) : in_range(mm) ? BEAM_OK : BEAM_OUT_OF_RANGE;
 	}
 	return misfits;
 }

@@ -29,11 +29,9 @@
 #include "tools/options.h"
 #include "tools/output.h"
 
-#define RANGE_MIN_M 0.3
-#define RANGE_MAX_M 30.0
-#define ROW_NS      100000000LL /* between the profiles of a scan; its servo stands while one is measured */
-#define BEAM_NS     37037
-#define FILE_MAX    ((size_t)4 << 30)
+#define ROW_NS   100000000LL /* between the profiles of a scan; its servo stands while one is measured */
+#define BEAM_NS  37037
+#define FILE_MAX ((size_t)4 << 30)
 
 enum stage { READ, ASSEMBLE, INTEGRATE, EXTRACT, REDUCE, WRITE, STAGES };
 
@@ -295,8 +293,8 @@ static int add_raster(struct run *run, const struct uos_scan *scan, const struct
 	const struct sweep_params params = {
 	    .base_tilt = transform_identity(),
 	    .tilt_laser = transform_identity(),
-	    .range_min_m = RANGE_MIN_M,
-	    .range_max_m = RANGE_MAX_M,
+	    .range_min_m = UOS_RANGE_MIN_M,
+	    .range_max_m = UOS_RANGE_MAX_M,
 	    .hold_ns = INT64_MAX,
 	    .fixed_pose = true,
 	    .map_base = *pose,
@@ -347,7 +345,7 @@ static int add_uos(struct run *run, const struct bytes *bytes, struct parse_erro
 	if (r == 0 && scan.rows)
 		r = add_raster(run, &scan, &pose);
 	else if (r == 0)
-		add_cloud(run, &scan.cloud, &pose, RANGE_MIN_M, RANGE_MAX_M);
+		add_cloud(run, &scan.cloud, &pose, UOS_RANGE_MIN_M, UOS_RANGE_MAX_M);
 	uos_finish(&scan);
 	return r;
 }

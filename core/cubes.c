@@ -21,7 +21,6 @@
 
 #define ROWS          (WINDOW_SIDE * WINDOW_SIDE)
 #define PARAMETER_MIN 4 /* 1/64 of an edge */
-#define NO_VERTEX     UINT16_MAX
 
 /* Bits of a row: corner i is bit i + WINDOW_LOW. */
 #define CORNERS_FILLED (((1u << (PATCH_SIDE + 3)) - 1) << (WINDOW_LOW - 1)) /* -1 .. 17 */
@@ -58,28 +57,37 @@ static uint64_t pack4(const struct voxel *v)
 	return load64(&v[0]) >> 48 | (load64(&v[1]) & top) >> 32 | (load64(&v[2]) & top) >> 16 | (load64(&v[3]) & top);
 }
 
-/* The upper bits of the four quarters of a word, as bits 0 .. 3. */
-static uint32_t top_bits(uint64_t word)
+/* The upper bits of the eight quarters of two words, as bits 0 .. 7. The factor moves bit 16 m (and 16 m + 4, which the
+ * second word is shifted to) to 48 + m (52 + m); no other product reaches bit 48 without leaving the word. */
+static inline uint32_t top_bits(uint64_t low, uint64_t high)
 {
-	return (word >> 15 & 0x0001000100010001ull) * 0x0001000200040008ull >> 48 & 15;
+	const uint64_t each = 0x0001000100010001ull;
+	return ((low >> 15 & each) | (high >> 11 & each << 4)) * 0x0001000200040008ull >> 48 & 0xff;
 }
 
-/* Bits of four values: which are known, which are negative (VOXEL_UNKNOWN too). */
-static void judge4(const int16_t *value, int shift, uint32_t *known, uint32_t *negative)
+/* The upper bit of every quarter that is not zero. */
+static inline uint64_t not_zero(uint64_t word)
 {
-	const uint64_t top = 0x8000800080008000ull;
-	uint64_t word = load64(value), differs = word ^ top;
-	*known |= top_bits(((differs & ~top) + ~top) | differs) << shift;
-	*negative |= top_bits(word) << shift;
+	const uint64_t low = 0x7fff7fff7fff7fffull;
+	return ((word & low) + low) | word;
 }
 
 /* `n` values from `value` on: bit b of the results belongs to value b. */
 static inline void judge_row(const int16_t *value, int n, uint32_t *ret_known, uint32_t *ret_inside)
 {
+	const uint64_t unknown = 0x8000800080008000ull;
 	uint32_t known = 0, negative = 0;
 	int b = 0;
-	for (; b + 4 <= n; b += 4)
-		judge4(value + b, b, &known, &negative);
+	for (; b + 8 <= n; b += 8) {
+		uint64_t low = load64(value + b), high = load64(value + b + 4);
+		known |= top_bits(not_zero(low ^ unknown), not_zero(high ^ unknown)) << b;
+		negative |= top_bits(low, high) << b;
+	}
+	for (; b + 4 <= n; b += 4) {
+		uint64_t low = load64(value + b);
+		known |= top_bits(not_zero(low ^ unknown), 0) << b;
+		negative |= top_bits(low, 0) << b;
+	}
 	for (; b < n; b++) {
 		known |= (uint32_t)(value[b] != VOXEL_UNKNOWN) << b;
 		negative |= (uint32_t)(value[b] < 0) << b;
@@ -116,23 +124,73 @@ static void copy_block(const struct block *block, const int at[3], int16_t *valu
 		}
 }
 
-/* How many blocks there were. */
-static int copy_blocks(const struct grid *grid, struct patch_key key, int16_t *value)
+/* All unknown: from one value by doubling, at the speed of memcpy. */
+static void forget_values(int16_t *value)
 {
-	int found = 0, at[3];
-	for (int i = 0; i < WINDOW_VOXELS; i++)
-		value[i] = VOXEL_UNKNOWN;
+	size_t n = 1;
+	value[0] = VOXEL_UNKNOWN;
+	for (; n * 2 <= WINDOW_VOXELS; n *= 2)
+		memcpy(value + n, value, n * sizeof *value);
+	memcpy(value + n, value, (WINDOW_VOXELS - n) * sizeof *value);
+}
+
+#define BLOCKS_A_SIDE 4
+
+/* Block (x, y, z) of the 4^3 that a window reads; the patch's own are 1 and 2 on each axis. */
+static int block_at(int x, int y, int z)
+{
+	return (z * BLOCKS_A_SIDE + y) * BLOCKS_A_SIDE + x;
+}
+
+static bool own_block(int b)
+{
+	return b == 1 || b == 2;
+}
+
+/* Looks the blocks up that share a face with the patch or belong to it, or all others. The bits of *ret_axes: 1, 2, 4 a
+ * neighbour exists along x, y, z; 8 one of the patch's own. */
+static void find_blocks(const struct grid *grid, struct patch_key key, bool others, const struct block **ret_blocks,
+                        int *ret_axes)
+{
+	for (int z = 0; z < BLOCKS_A_SIDE; z++)
+		for (int y = 0; y < BLOCKS_A_SIDE; y++)
+			for (int x = 0; x < BLOCKS_A_SIDE; x++) {
+				int outside = !own_block(x) + 2 * !own_block(y) + 4 * !own_block(z);
+				bool near = outside == 0 || (outside & (outside - 1)) == 0;
+				struct block_key name = {key.x * 2 + x - 1, key.y * 2 + y - 1, key.z * 2 + z - 1};
+				if (near == others)
+					continue;
+				ret_blocks[block_at(x, y, z)] = grid_find(grid, name);
+				if (near && ret_blocks[block_at(x, y, z)])
+					*ret_axes |= outside ? outside : 8;
+			}
+}
+
+/* A cell of the patch has a corner in one of the patch's own blocks. Where there is none of them, that corner must be a
+ * filled one, so there are neighbours on two axes: most of the patches around a surface are told apart by this alone. */
+static bool may_have_cells(int axes)
+{
+	return axes >= 8 || (axes & (axes - 1)) != 0;
+}
+
+/* False where no cell of the patch can be complete; then nothing was copied. */
+static bool copy_blocks(const struct grid *grid, struct patch_key key, int16_t *value)
+{
+	const struct block *blocks[BLOCKS_A_SIDE * BLOCKS_A_SIDE * BLOCKS_A_SIDE];
+	int axes = 0, at[3];
+	find_blocks(grid, key, false, blocks, &axes);
+	if (!may_have_cells(axes))
+		return false;
+	find_blocks(grid, key, true, blocks, &axes);
+	forget_values(value);
 	for (at[2] = -1; at[2] < 3; at[2]++)
 		for (at[1] = -1; at[1] < 3; at[1]++)
 			for (at[0] = -1; at[0] < 3; at[0]++) {
-				struct block_key name = {key.x * 2 + at[0], key.y * 2 + at[1], key.z * 2 + at[2]};
-				const struct block *block = grid_find(grid, name);
-				if (!block)
-					continue;
-				copy_block(block, at, value);
-				found++;
+				const struct block *block = blocks[block_at(at[0] + 1, at[1] + 1, at[2] + 1)];
+				if (block)
+					copy_block(block, at, value);
 			}
-	return found;
+	return true;
 }
 
 /* Whether both signs occur. */
@@ -166,7 +224,7 @@ static void fill_row(const uint32_t *known, const uint32_t *inside, uint32_t *re
 }
 
 /* Cells of a row with a surface: complete, of both signs. The rows are those of the corners after the fill. */
-static uint32_t active_cells(const uint32_t *known, const uint32_t *inside, int y, int z)
+static inline uint32_t active_cells(const uint32_t *known, const uint32_t *inside, int y, int z)
 {
 	uint32_t all = known[0] & known[y] & known[z] & known[y + z];
 	uint32_t any = inside[0] | inside[y] | inside[z] | inside[y + z];
@@ -260,7 +318,7 @@ bool window_cell_complete(const struct window *window, int i, int j, int k)
 #define CORNERS      (PATCH_SIDE + 1)
 #define VERTEX_NAMES (CORNERS * CORNERS * CORNERS * 3)
 
-static_assert(VERTEX_NAMES < NO_VERTEX, "a vertex index of a raw patch fits 16 bits");
+static_assert(VERTEX_NAMES < UINT16_MAX, "a vertex index of a raw patch fits 16 bits");
 
 struct active_cell {
 	uint8_t i, j, k, code;
@@ -270,7 +328,7 @@ struct extraction {
 	const struct window *window;
 	struct active_cell *cell;
 	uint32_t cells, triangles;
-	uint16_t *index; /* [VERTEX_NAMES] vertex of a name, or NO_VERTEX */
+	uint16_t *index; /* [VERTEX_NAMES] vertex of a name + 1, or 0: none so far */
 };
 
 static void sign_rows(const struct window *window, uint32_t *ret_known, uint32_t *ret_inside)
@@ -328,7 +386,7 @@ static uint32_t make_vertex(struct extraction *x, struct surface *surface, const
 		surface->vertex[v][a] = (uint16_t)(at[a] * LATTICE);
 	surface->vertex[v][axis] += (uint16_t)edge_parameter(value[0], value[step[axis]]);
 	surface->name[v] = name;
-	x->index[name] = (uint16_t)v;
+	x->index[name] = (uint16_t)(v + 1);
 	return v;
 }
 
@@ -342,8 +400,7 @@ static void extract_cell(struct extraction *x, struct surface *surface, struct a
 			             cell.k + edge_corner[e][2]};
 			uint32_t name = vertex_name(at[0], at[1], at[2], axis);
 			uint32_t v = x->index[name];
-			surface->triangle[surface->nt][c] =
-			    v != NO_VERTEX ? v : make_vertex(x, surface, at, axis, name);
+			surface->triangle[surface->nt][c] = v ? v - 1 : make_vertex(x, surface, at, axis, name);
 		}
 }
 
@@ -358,7 +415,6 @@ static int reserve(struct extraction *x, struct arena *arena, struct surface *re
 	x->index = ARENA_NEW(arena, uint16_t, VERTEX_NAMES);
 	if (!ret->vertex || !ret->name || !ret->triangle || !x->index)
 		return -ENOMEM;
-	memset(x->index, 0xff, VERTEX_NAMES * sizeof *x->index);
 	return 0;
 }
 

@@ -13,10 +13,14 @@
 #define WINDOW_SIDE (PATCH_SIDE + 5)                   /* corners -2 .. 18 */
 #define WINDOW_VOXELS (WINDOW_SIDE * WINDOW_SIDE * WINDOW_SIDE)
 
-/* Corner values of a patch and its halo; index with window_at. Filled corners (-1 .. 17) carry their neighbour's value. */
+/* Corner values of a patch and its halo; index with window_at.
+ *
+ * Fill: an unknown corner of -1 .. 17 with known neighbours on two or more axes, all of one sign, takes the value of the
+ * largest magnitude among them (from unfilled values only). It is stored for corners of complete cells of both signs;
+ * elsewhere the fill would change no mesh, and the corner stays unknown. */
 struct window {
 	struct patch_key key;
-	bool empty; /* no cell of the patch has a surface: nothing to extract */
+	bool empty; /* no cell of the patch has a surface: nothing to extract, and the values mean nothing */
 	int16_t value[WINDOW_VOXELS]; /* 1/256 cell, VOXEL_UNKNOWN */
 };
 

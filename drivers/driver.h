@@ -91,7 +91,7 @@ struct driver {
 
 	/* open answers at once (a slow connect goes on behind the descriptor); NULL with one sentence in `error`. */
 	struct link *(*link_open)(const struct config_device *, char error[160]);
-	int (*link_fd)(const struct link *);                     /* pollable for reading */
+	int (*link_fd)(const struct link *);                     /* pollable for reading; -1: nothing to poll or read, it streams for ever (a fixed pose) */
 	ssize_t (*link_read)(struct link *, uint8_t *buf, size_t cap, int64_t *t_ns); /* bytes, 0: nothing now, -errno: lost. *t_ns is changed where the link knows better than the caller */
 	ssize_t (*link_write)(struct link *, const uint8_t *bytes, size_t len);       /* bytes taken (0: would block) or -errno */
 	int (*link_baud)(struct link *, uint32_t baud, char error[160]);              /* NULL where there is none */

@@ -5,6 +5,8 @@
 
 const struct driver *const driver_table[] = {
     &driver_lms2xx,
+    &driver_modbus,
+    &driver_pose,
     NULL,
 };
 

@@ -51,7 +51,7 @@ struct sim_servo;
 struct sim_servo *sim_servo_create(const struct sim_servo_params *, char error[160]);
 void sim_servo_destroy(struct sim_servo *);
 int sim_servo_port(const struct sim_servo *);                     /* TCP port it listens on */
-double sim_servo_angle(struct sim_servo *, int64_t t_ns);         /* rad, at any time within the last seconds; any thread */
+double sim_servo_angle(struct sim_servo *, int64_t t_ns);         /* rad, at any time within the last seconds (CLOCK_MONOTONIC, as uv_hrtime); any thread */
 void sim_servo_place(struct sim_servo *, double angle_rad);       /* stands there from now on (playback steps) */
 uint64_t sim_servo_answers(struct sim_servo *);                   /* position reads answered so far */
 

@@ -1,0 +1,181 @@
+/* A tilt servo behind Modbus: decoder and table; the bus itself is modbus_bus.c, the sweeping modbus_dialogue.c.
+ *
+ * A polled angle was true somewhere between request and answer, so it is stamped at their midpoint; its uncertainty is
+ * half the round trip. An answer that took more than three times the median of the last ones waited somewhere nobody
+ * knows: it is refused and counted. Round trips of up to a millisecond are never refused: half of that is 0.015 degree
+ * at 30 degrees a second, and on a fast network three times the median is within the jitter of any scheduler. */
+#include "drivers/modbus_parts.h"
+
+#include <stdlib.h>
+#include <string.h>
+
+#define RTT_KEPT    31 /* odd: the median is one of them */
+#define RTT_JUDGED  7  /* before so many are known nothing is refused */
+#define RTT_GOOD_NS 1000000
+#define RTT_LIMIT   3
+
+enum { ANGLES, WRITES, REFUSED, NO_ANSWER, SLOW, FOREIGN, MALFORMED, COUNTERS };
+static const char *const counter_name[COUNTERS] = {"angles", "writes",  "refused",  "no answer",
+                                                   "slow",   "foreign", "malformed"};
+
+struct decoder {
+	struct config_device device;
+	int index;
+	int64_t rtt_ns[RTT_KEPT];
+	int rtt_n, rtt_next;
+	uint64_t count[COUNTERS];
+};
+
+static struct decoder *decoder_create(const struct config_device *device, int index)
+{
+	struct decoder *d = calloc(1, sizeof *d);
+
+	if (d) {
+		d->device = *device;
+		d->index = index;
+	}
+	return d;
+}
+
+static void decoder_destroy(struct decoder *d)
+{
+	free(d);
+}
+
+static int64_t rtt_median(const struct decoder *d)
+{
+	int64_t sorted[RTT_KEPT];
+
+	for (int i = 0; i < d->rtt_n; i++) {
+		int at = i;
+
+		for (; at > 0 && sorted[at - 1] > d->rtt_ns[i]; at--)
+			sorted[at] = sorted[at - 1];
+		sorted[at] = d->rtt_ns[i];
+	}
+	return sorted[d->rtt_n / 2];
+}
+
+/* Slow ones are remembered too: a bus that becomes slower for good is followed. */
+static bool rtt_is_slow(struct decoder *d, int64_t rtt_ns)
+{
+	bool slow = d->rtt_n >= RTT_JUDGED && rtt_ns > RTT_GOOD_NS && rtt_ns / RTT_LIMIT > rtt_median(d);
+
+	d->rtt_ns[d->rtt_next] = rtt_ns;
+	d->rtt_next = (d->rtt_next + 1) % RTT_KEPT;
+	if (d->rtt_n < RTT_KEPT)
+		d->rtt_n++;
+	return slow;
+}
+
+static void say(struct decoder *d, const struct record_sink *sink, int64_t t_ns, int kind, const void *payload,
+                size_t len)
+{
+	struct reply reply = {.t_ns = t_ns, .kind = kind, .payload = payload, .len = len};
+
+	if (sink->reply)
+		sink->reply(sink->ctx, d->index, &reply);
+}
+
+static void decode_angle(struct decoder *d, const struct modbus_transaction *t, const struct record_sink *sink)
+{
+	const struct config_register *position = &d->device.position;
+	int64_t rtt_ns = t->t_answer_ns - t->t_request_ns;
+	struct tilt tilt = {.t_ns = t->t_request_ns + rtt_ns / 2};
+
+	if (t->function != position->function || t->address != modbus_wire_address(&d->device, position->address) ||
+	    t->n != modbus_wire_registers(position)) {
+		d->count[FOREIGN]++;
+		return;
+	}
+	if (modbus_wire_decode(position, t->value, &tilt.angle_rad) < 0) {
+		d->count[MALFORMED]++;
+		return;
+	}
+	if (rtt_is_slow(d, rtt_ns)) {
+		d->count[SLOW]++;
+		return;
+	}
+	d->count[ANGLES]++;
+	sink->tilt(sink->ctx, d->index, &tilt);
+	say(d, sink, t->t_answer_ns, MODBUS_ANGLE, &tilt.angle_rad, sizeof tilt.angle_rad);
+}
+
+static void decode_refusal(struct decoder *d, const struct modbus_transaction *t, const struct record_sink *sink)
+{
+	uint16_t what[3] = {(uint16_t)(t->function & ~MODBUS_WIRE_REFUSED), t->address, t->value[0]};
+
+	d->count[t->value[0] ? REFUSED : NO_ANSWER]++;
+	say(d, sink, t->t_answer_ns, MODBUS_REFUSED, what, sizeof what);
+}
+
+static void decode_transaction(struct decoder *d, const struct modbus_transaction *t, const struct record_sink *sink)
+{
+	int64_t rtt_ns;
+
+	/* A replayed or hostile record may carry any times: a round trip is positive and shorter than any time-out. */
+	if (__builtin_sub_overflow(t->t_answer_ns, t->t_request_ns, &rtt_ns) || rtt_ns < 0 || rtt_ns > 60000000000) {
+		d->count[MALFORMED]++;
+		return;
+	}
+	if (t->unit != d->device.slave) {
+		d->count[FOREIGN]++;
+	} else if (t->function & MODBUS_WIRE_REFUSED) {
+		decode_refusal(d, t, sink);
+	} else if (t->function == 3 || t->function == 4) {
+		decode_angle(d, t, sink);
+	} else {
+		d->count[WRITES]++;
+		say(d, sink, t->t_answer_ns, MODBUS_WRITTEN, &t->address, sizeof t->address);
+	}
+}
+
+/* What goes to the device carries nothing that its answer does not say again. */
+static void decode(struct decoder *d, const struct record *record, const struct record_sink *sink)
+{
+	struct modbus_transaction t;
+	size_t at = 0;
+
+	if (record->direction != FROM_DEVICE)
+		return;
+	while (at < record->len) {
+		ssize_t n = modbus_wire_get(record->bytes + at, record->len - at, &t);
+
+		if (n <= 0) {
+			d->count[MALFORMED]++;
+			return;
+		}
+		decode_transaction(d, &t, sink);
+		at += (size_t)n;
+	}
+}
+
+static void counters(const struct decoder *d, struct decoder_counters *ret)
+{
+	ret->n = COUNTERS;
+	for (int i = 0; i < COUNTERS; i++) {
+		ret->counter[i].name = counter_name[i];
+		ret->counter[i].count = d->count[i];
+	}
+}
+
+const struct driver driver_modbus = {
+    .name = "modbus",
+    .role = ROLE_TILT,
+    .decoder_create = decoder_create,
+    .decoder_destroy = decoder_destroy,
+    .decode = decode,
+    .counters = counters,
+    .dialogue_create = modbus_dialogue_create,
+    .dialogue_destroy = modbus_dialogue_destroy,
+    .dialogue_reset = modbus_dialogue_reset,
+    .dialogue_reply = modbus_dialogue_reply,
+    .dialogue_data = modbus_dialogue_data,
+    .dialogue_step = modbus_dialogue_step,
+    .dialogue_stop = modbus_dialogue_stop,
+    .link_open = modbus_bus_open,
+    .link_fd = modbus_bus_fd,
+    .link_read = modbus_bus_read,
+    .link_write = modbus_bus_write,
+    .link_close = modbus_bus_close,
+};

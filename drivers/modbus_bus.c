@@ -1,0 +1,434 @@
+/* The bus: libmodbus blocks, so each bus has one thread that waits for it, and the loop never does (design D3).
+ *
+ *   loop  --- wishes to write --->  thread  --- requests --->  device
+ *         <-- completed records --          <--- answers ----
+ *
+ * The two speak over a pair of sequenced-packet sockets: one message is one record (modbus_wire.h), and closing the
+ * loop's end is the message that ends the thread; nobody joins it. It connects by itself, so a host that does not answer
+ * costs the loop nothing. When the bus is lost it closes the device first and then says so with a message of four bytes,
+ * a negative errno; whoever opens anew (the supervisor, with its back-off) therefore finds the line free. A lock on a
+ * serial line keeps a second program from talking in between.
+ *
+ * An answer that comes after its time-out must never be taken for the answer to the next request. TCP numbers its
+ * answers, yet libmodbus only notices a wrong number: the connection is given up. A serial line has no numbers: the
+ * thread listens until the line was silent for a whole response time, and gives up after three failures in a row.
+ *
+ * The thread stamps with CLOCK_MONOTONIC. The loop's clock is that plus a constant, learned at each read as the largest
+ * difference seen: the loop took its time before the read, so the difference is never too large. */
+#include "drivers/modbus_parts.h"
+
+#include <errno.h>
+#include <fcntl.h>
+#include <modbus.h>
+#include <poll.h>
+#include <pthread.h>
+#include <signal.h>
+#include <stdio.h>
+#include <stdlib.h>
+#include <string.h>
+#include <sys/file.h>
+#include <sys/select.h>
+#include <sys/socket.h>
+#include <time.h>
+#include <unistd.h>
+
+#define RESPONSE_US    250000
+#define BYTE_US        100000
+#define CONNECT_S      1
+#define FAILURES_MAX   3
+#define PERIOD_MIN_NS  2000000 /* nobody needs more than 500 angles a second */
+#define SILENCE_MIN_NS 1750000 /* between frames above 19200 Bd */
+#define BAUD_DEFAULT   115200
+
+struct link {
+	int fd;
+	bool offset_known;
+	int64_t offset_ns; /* the loop's clock minus CLOCK_MONOTONIC */
+};
+
+struct bus { /* the thread's own; it frees it */
+	int fd;
+	struct config_device device;
+	modbus_t *modbus;
+	bool serial;
+	int64_t silence_ns, free_ns; /* the line may be used from then on */
+	int failures;
+};
+
+static int64_t monotonic_ns(void)
+{
+	struct timespec ts;
+
+	clock_gettime(CLOCK_MONOTONIC, &ts);
+	return (int64_t)ts.tv_sec * 1000000000 + ts.tv_nsec;
+}
+
+static bool is_serial(const char *connect)
+{
+	return strchr(connect, '/') != NULL;
+}
+
+/* "host:port" or "[v6]:port" in two parts; false where it is neither. */
+static bool split_address(const char *connect, char host[CONFIG_TEXT_MAX], char port[8])
+{
+	const char *colon = strrchr(connect, ':');
+	size_t len;
+
+	if (!colon || colon == connect || strlen(colon + 1) < 1 || strlen(colon + 1) > 5)
+		return false;
+	strcpy(port, colon + 1);
+	len = (size_t)(colon - connect);
+	if (connect[0] == '[' && connect[len - 1] == ']' && len > 2) {
+		connect++;
+		len -= 2;
+	}
+	memcpy(host, connect, len);
+	host[len] = '\0';
+	return true;
+}
+
+static int errno_of_modbus(void)
+{
+	if (errno >= MODBUS_ENOBASE)
+		return EPROTO;
+	return errno ? errno : EIO;
+}
+
+/* What libmodbus' select() cannot watch it would write beyond its set; what another program holds is not ours. */
+static int claim(struct bus *bus)
+{
+	int fd = modbus_get_socket(bus->modbus);
+
+	if (fd < 0 || fd >= FD_SETSIZE)
+		return -EMFILE;
+	fcntl(fd, F_SETFD, FD_CLOEXEC);
+	if (bus->serial && flock(fd, LOCK_EX | LOCK_NB) < 0)
+		return -EBUSY;
+	if (bus->serial)
+		modbus_flush(bus->modbus); /* bytes from before are nobody's answer */
+	return 0;
+}
+
+static int bus_connect(struct bus *bus)
+{
+	const struct config_device *d = &bus->device;
+	uint32_t baud = d->baud ? d->baud : BAUD_DEFAULT;
+	char host[CONFIG_TEXT_MAX], port[8];
+
+	if (bus->serial)
+		bus->modbus = modbus_new_rtu(d->connect, (int)baud, d->parity ? d->parity : 'N', 8, 1);
+	else if (split_address(d->connect, host, port))
+		bus->modbus = modbus_new_tcp_pi(host, port);
+	if (!bus->modbus)
+		return -errno_of_modbus();
+	bus->silence_ns = bus->serial ? INT64_C(35000000000) / baud : 0;
+	if (bus->serial && bus->silence_ns < SILENCE_MIN_NS)
+		bus->silence_ns = SILENCE_MIN_NS;
+	modbus_set_slave(bus->modbus, d->slave);
+	modbus_set_response_timeout(bus->modbus, CONNECT_S, 0);
+	if (modbus_connect(bus->modbus) < 0)
+		return -errno_of_modbus();
+	modbus_set_response_timeout(bus->modbus, 0, RESPONSE_US);
+	modbus_set_byte_timeout(bus->modbus, 0, BYTE_US);
+	return claim(bus);
+}
+
+static void bus_disconnect(struct bus *bus)
+{
+	if (!bus->modbus)
+		return;
+	modbus_close(bus->modbus);
+	modbus_free(bus->modbus);
+	bus->modbus = NULL;
+}
+
+static void sleep_until(int64_t t_ns)
+{
+	struct timespec ts = {.tv_sec = t_ns / 1000000000, .tv_nsec = t_ns % 1000000000};
+
+	while (clock_nanosleep(CLOCK_MONOTONIC, TIMER_ABSTIME, &ts, NULL) == EINTR)
+		continue;
+}
+
+/* Reads away what still comes, until the line was silent for a response time; at most ten of them. */
+static void drain(struct bus *bus)
+{
+	struct pollfd p = {.fd = modbus_get_socket(bus->modbus), .events = POLLIN};
+	uint8_t waste[256];
+	int64_t end_ns = monotonic_ns() + INT64_C(10) * RESPONSE_US * 1000;
+
+	while (monotonic_ns() < end_ns && poll(&p, 1, RESPONSE_US / 1000) > 0)
+		if (read(p.fd, waste, sizeof waste) <= 0)
+			break;
+	modbus_flush(bus->modbus);
+}
+
+static int request(struct bus *bus, struct modbus_transaction *t)
+{
+	int n = t->n, address = t->address;
+	int r;
+
+	switch (t->function) {
+	case 3:
+		r = modbus_read_registers(bus->modbus, address, n, t->value);
+		break;
+	case 4:
+		r = modbus_read_input_registers(bus->modbus, address, n, t->value);
+		break;
+	case 6:
+		r = modbus_write_register(bus->modbus, address, t->value[0]);
+		break;
+	default:
+		r = modbus_write_registers(bus->modbus, address, n, t->value);
+		break;
+	}
+	return r < 0 ? -errno : 0;
+}
+
+static void refuse(struct modbus_transaction *t, int code)
+{
+	t->function |= MODBUS_WIRE_REFUSED;
+	t->n = 1;
+	t->value[0] = (uint16_t)code;
+}
+
+/* 0: go on; -errno: the bus is lost. The transaction says what became of it. */
+static int judge(struct bus *bus, int error, struct modbus_transaction *t)
+{
+	int code = error - MODBUS_ENOBASE;
+
+	if (!error) {
+		bus->failures = 0;
+		return 0;
+	}
+	if (code >= MODBUS_EXCEPTION_ILLEGAL_FUNCTION && code < MODBUS_EXCEPTION_MAX) {
+		bus->failures = 0;
+		refuse(t, code);
+		return 0;
+	}
+	refuse(t, 0);
+	if (error != ETIMEDOUT && error < MODBUS_ENOBASE)
+		return -error;
+	if (!bus->serial || ++bus->failures >= FAILURES_MAX)
+		return error == ETIMEDOUT ? -ETIMEDOUT : -EPROTO;
+	drain(bus);
+	return 0;
+}
+
+/* A loop that reads no more (or is gone) loses records; it notices the end of the bus by the closed socket. */
+static void send_record(struct bus *bus, const struct modbus_transaction *t)
+{
+	uint8_t bytes[MODBUS_WIRE_MAX];
+
+	(void)!send(bus->fd, bytes, modbus_wire_put(t, bytes), MSG_DONTWAIT | MSG_NOSIGNAL);
+}
+
+static int transact(struct bus *bus, struct modbus_transaction *t)
+{
+	int r;
+
+	sleep_until(bus->free_ns);
+	t->unit = (uint8_t)bus->device.slave;
+	t->t_request_ns = monotonic_ns();
+	r = request(bus, t);
+	t->t_answer_ns = monotonic_ns();
+	r = judge(bus, -r, t);
+	bus->free_ns = monotonic_ns() + bus->silence_ns;
+	send_record(bus, t);
+	return r;
+}
+
+/* One wish of the loop: 0; -ECONNRESET: the loop closed its end; -errno: the bus is lost. */
+static int serve_wish(struct bus *bus)
+{
+	uint8_t bytes[MODBUS_WIRE_MAX];
+	struct modbus_transaction t;
+	ssize_t n = recv(bus->fd, bytes, sizeof bytes, MSG_DONTWAIT);
+
+	if (n < 0)
+		return errno == EAGAIN || errno == EINTR ? 0 : -errno;
+	if (n == 0)
+		return -ECONNRESET;
+	if (modbus_wire_get(bytes, (size_t)n, &t) <= 0 || (t.function != 6 && t.function != 16) ||
+	    t.n > MODBUS_MAX_WRITE_REGISTERS)
+		return 0;
+	return transact(bus, &t);
+}
+
+static int poll_position(struct bus *bus)
+{
+	const struct config_register *position = &bus->device.position;
+	struct modbus_transaction t = {.function = position->function,
+	                               .address = modbus_wire_address(&bus->device, position->address),
+	                               .n = (uint16_t)modbus_wire_registers(position)};
+
+	return transact(bus, &t);
+}
+
+/* Until the bus is lost or the loop has gone. A poll that is late is not made up for: the queue never builds up. */
+static int bus_run(struct bus *bus)
+{
+	int64_t period_ns = bus->device.period_ns > PERIOD_MIN_NS ? bus->device.period_ns : PERIOD_MIN_NS;
+	int64_t next_ns = monotonic_ns();
+
+	for (;;) {
+		struct pollfd p = {.fd = bus->fd, .events = POLLIN};
+		int64_t wait_ns = next_ns - monotonic_ns();
+		struct timespec ts = {.tv_sec = wait_ns / 1000000000, .tv_nsec = wait_ns % 1000000000};
+		int r = 0;
+
+		if (wait_ns > 0)
+			ppoll(&p, 1, &ts, NULL);
+		else
+			poll(&p, 1, 0);
+		if (p.revents)
+			r = serve_wish(bus);
+		if (!r && monotonic_ns() >= next_ns) {
+			r = poll_position(bus);
+			next_ns += period_ns;
+			if (next_ns < monotonic_ns())
+				next_ns = monotonic_ns();
+		}
+		if (r)
+			return r;
+	}
+}
+
+static void *bus_thread(void *arg)
+{
+	struct bus *bus = arg;
+	int32_t lost = bus_connect(bus);
+
+	if (!lost)
+		lost = bus_run(bus);
+	bus_disconnect(bus);
+	(void)!send(bus->fd, &lost, sizeof lost, MSG_DONTWAIT | MSG_NOSIGNAL);
+	close(bus->fd);
+	free(bus);
+	return NULL;
+}
+
+/* Signals are the loop's. */
+static int start_thread(struct bus *bus)
+{
+	pthread_attr_t attr;
+	pthread_t thread;
+	sigset_t all, before;
+	int r;
+
+	sigfillset(&all);
+	pthread_attr_init(&attr);
+	pthread_attr_setdetachstate(&attr, PTHREAD_CREATE_DETACHED);
+	pthread_sigmask(SIG_SETMASK, &all, &before);
+	r = pthread_create(&thread, &attr, bus_thread, bus);
+	pthread_sigmask(SIG_SETMASK, &before, NULL);
+	pthread_attr_destroy(&attr);
+	return -r;
+}
+
+static bool address_is_good(const struct config_device *device, char error[160])
+{
+	char host[CONFIG_TEXT_MAX], port[8];
+
+	if (!is_serial(device->connect)) {
+		if (split_address(device->connect, host, port))
+			return true;
+		snprintf(error, 160, "%.80s is neither a path of a serial line nor HOST:PORT", device->connect);
+		return false;
+	}
+	if (access(device->connect, R_OK | W_OK) == 0)
+		return true;
+	snprintf(error, 160, "%.80s: %s%s", device->connect, strerror(errno),
+	         errno == EACCES ? "; is the user in the group dialout?" : "");
+	return false;
+}
+
+struct link *modbus_bus_open(const struct config_device *device, char error[160])
+{
+	struct link *link = calloc(1, sizeof *link);
+	struct bus *bus = calloc(1, sizeof *bus);
+	int pair[2], r = -ENOMEM;
+
+	if (!link || !bus)
+		goto fail;
+	r = 0;
+	if (!address_is_good(device, error))
+		goto fail_said;
+	if (socketpair(AF_UNIX, SOCK_SEQPACKET | SOCK_CLOEXEC, 0, pair) < 0) {
+		r = -errno;
+		goto fail;
+	}
+	link->fd = pair[0];
+	bus->fd = pair[1];
+	bus->device = *device;
+	bus->serial = is_serial(device->connect);
+	r = start_thread(bus);
+	if (!r)
+		return link;
+	close(pair[0]);
+	close(pair[1]);
+fail:
+	snprintf(error, 160, "%.80s: %s", device->connect, strerror(-r));
+fail_said:
+	free(bus);
+	free(link);
+	return NULL;
+}
+
+int modbus_bus_fd(const struct link *link)
+{
+	return link->fd;
+}
+
+/* From the thread's clock to the loop's. */
+static size_t restamp(struct link *link, uint8_t *bytes, size_t len, int64_t *t_ns)
+{
+	int64_t offset_ns = *t_ns - monotonic_ns();
+	struct modbus_transaction t;
+
+	if (!link->offset_known || offset_ns > link->offset_ns)
+		link->offset_ns = offset_ns;
+	link->offset_known = true;
+	if (modbus_wire_get(bytes, len, &t) <= 0)
+		return len;
+	t.t_request_ns += link->offset_ns;
+	t.t_answer_ns += link->offset_ns;
+	*t_ns = t.t_answer_ns;
+	return modbus_wire_put(&t, bytes);
+}
+
+ssize_t modbus_bus_read(struct link *link, uint8_t *buf, size_t cap, int64_t *t_ns)
+{
+	uint8_t bytes[MODBUS_WIRE_MAX];
+	int32_t lost;
+	ssize_t n = recv(link->fd, bytes, sizeof bytes, MSG_DONTWAIT);
+
+	if (n < 0)
+		return errno == EAGAIN || errno == EINTR ? 0 : -errno;
+	if (n == sizeof lost) {
+		memcpy(&lost, bytes, sizeof lost);
+		return lost < 0 ? lost : -EIO;
+	}
+	if (n == 0 || (size_t)n > cap)
+		return -EIO;
+	n = (ssize_t)restamp(link, bytes, (size_t)n, t_ns);
+	memcpy(buf, bytes, (size_t)n);
+	return n;
+}
+
+ssize_t modbus_bus_write(struct link *link, const uint8_t *bytes, size_t len)
+{
+	ssize_t n = send(link->fd, bytes, len, MSG_DONTWAIT | MSG_NOSIGNAL);
+
+	if (n < 0)
+		return errno == EAGAIN || errno == EINTR ? 0 : -errno;
+	return n;
+}
+
+void modbus_bus_close(struct link *link)
+{
+	if (!link)
+		return;
+	close(link->fd);
+	free(link);
+}

@@ -1,0 +1,32 @@
+/* What the three files of the Modbus driver share: modbus.c (decoder and table), modbus_bus.c (the thread that waits for
+ * libmodbus), modbus_dialogue.c (set-up and sweeping). Nobody else includes it, tests apart. */
+#ifndef FACET_DRIVERS_MODBUS_PARTS_H
+#define FACET_DRIVERS_MODBUS_PARTS_H
+
+#include "drivers/driver.h"
+#include "drivers/modbus_wire.h"
+
+/* Kinds of `struct reply`. */
+enum modbus_reply {
+	MODBUS_ANGLE,   /* payload: one double, rad, as decoded */
+	MODBUS_WRITTEN, /* payload: u16 address as on the wire */
+	MODBUS_REFUSED  /* payload: u16 function, u16 address, u16 exception code (0: no valid answer came) */
+};
+
+/* The link of modbus_bus.c. */
+struct link *modbus_bus_open(const struct config_device *, char error[160]);
+int modbus_bus_fd(const struct link *);
+ssize_t modbus_bus_read(struct link *, uint8_t *buf, size_t cap, int64_t *t_ns);
+ssize_t modbus_bus_write(struct link *, const uint8_t *bytes, size_t len);
+void modbus_bus_close(struct link *);
+
+/* The dialogue of modbus_dialogue.c. */
+struct dialogue *modbus_dialogue_create(const struct config *, int device);
+void modbus_dialogue_destroy(struct dialogue *);
+void modbus_dialogue_reset(struct dialogue *, int64_t t_ns);
+void modbus_dialogue_reply(struct dialogue *, const struct reply *);
+void modbus_dialogue_data(struct dialogue *, int64_t t_ns);
+void modbus_dialogue_step(struct dialogue *, int64_t t_ns, struct dialogue_step *ret);
+void modbus_dialogue_stop(struct dialogue *, int64_t t_ns);
+
+#endif

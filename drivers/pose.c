@@ -1,0 +1,255 @@
+/* Poses from somebody else's localisation: one JSON object per datagram (pose_line.h), over a unix socket or UDP.
+ *
+ * UDP is taken on loopback only: whoever may send a pose moves the map, and there is no password in the line. The unix
+ * socket has mode 0660. A socket file that nobody listens to is left over from a program that died, and is replaced; one
+ * that answers belongs to somebody and is refused; what is no socket is never removed.
+ *
+ * A device with `fixed` has no link: link_fd answers -1, nothing is ever read, and the assembler takes the pose from
+ * config_sweep_params. The supervisor counts a link without a descriptor as streaming for ever. */
+#include "drivers/pose_line.h"
+
+#include <arpa/inet.h>
+#include <errno.h>
+#include <netinet/in.h>
+#include <stdio.h>
+#include <stdlib.h>
+#include <string.h>
+#include <sys/socket.h>
+#include <sys/stat.h>
+#include <sys/un.h>
+#include <unistd.h>
+
+#include "drivers/driver.h"
+
+struct decoder {
+	int index;
+	uint64_t count[POSE_LINE_VERDICTS];
+};
+
+static struct decoder *decoder_create(const struct config_device *device, int index)
+{
+	struct decoder *d = calloc(1, sizeof *d);
+
+	(void)device;
+	if (d)
+		d->index = index;
+	return d;
+}
+
+static void decoder_destroy(struct decoder *d)
+{
+	free(d);
+}
+
+static void decode(struct decoder *d, const struct record *record, const struct record_sink *sink)
+{
+	enum pose_line_verdict verdict;
+	struct pose pose;
+
+	if (record->direction != FROM_DEVICE)
+		return;
+	verdict = pose_line_parse((const char *)record->bytes, record->len, record->t_ns, &pose);
+	d->count[verdict]++;
+	if (verdict == POSE_LINE_OK)
+		sink->pose(sink->ctx, d->index, &pose);
+}
+
+static void counters(const struct decoder *d, struct decoder_counters *ret)
+{
+	ret->n = POSE_LINE_VERDICTS;
+	for (int i = 0; i < POSE_LINE_VERDICTS; i++) {
+		ret->counter[i].name = pose_line_name((enum pose_line_verdict)i);
+		ret->counter[i].count = d->count[i];
+	}
+}
+
+struct link {
+	int fd;     /* -1: a fixed pose */
+	bool bound; /* to a path, which is ours as long as it is this inode */
+	char path[sizeof((struct sockaddr_un *)0)->sun_path];
+	dev_t dev;
+	ino_t ino;
+};
+
+/* Does anybody receive at this path? */
+static bool is_alive(const struct sockaddr_un *address)
+{
+	int fd = socket(AF_UNIX, SOCK_DGRAM | SOCK_CLOEXEC, 0);
+	bool alive =
+	    fd < 0 || connect(fd, (const struct sockaddr *)address, sizeof *address) == 0 || errno != ECONNREFUSED;
+
+	if (fd >= 0)
+		close(fd);
+	return alive;
+}
+
+/* Binds, once more after the file of a dead program was removed. */
+static int bind_path(int fd, const struct sockaddr_un *address)
+{
+	struct stat st;
+
+	if (bind(fd, (const struct sockaddr *)address, sizeof *address) == 0)
+		return 0;
+	if (errno != EADDRINUSE || lstat(address->sun_path, &st) < 0 || !S_ISSOCK(st.st_mode) || is_alive(address))
+		return -errno;
+	if (unlink(address->sun_path) < 0 || bind(fd, (const struct sockaddr *)address, sizeof *address) < 0)
+		return -errno;
+	return 0;
+}
+
+/* The mode is set before the file appears, and again after it for a umask that took the group's part. */
+static int open_unix(struct link *link, const char *path, char error[160])
+{
+	struct sockaddr_un address = {.sun_family = AF_UNIX};
+	struct stat st;
+	int r;
+
+	if (strlen(path) >= sizeof address.sun_path || !*path) {
+		snprintf(error, 160, "unix:%.40s...: a socket's path has 1 to %zu bytes", path,
+		         sizeof address.sun_path - 1);
+		return -1;
+	}
+	strcpy(address.sun_path, path);
+	link->fd = socket(AF_UNIX, SOCK_DGRAM | SOCK_NONBLOCK | SOCK_CLOEXEC, 0);
+	r = link->fd < 0 ? -errno : 0;
+	if (!r)
+		fchmod(link->fd, 0660);
+	if (!r)
+		r = bind_path(link->fd, &address);
+	if (r) {
+		snprintf(error, 160, "unix:%s: %s", path,
+		         r == -EADDRINUSE ? "somebody listens there already, or it is no socket" : strerror(-r));
+		return -1;
+	}
+	strcpy(link->path, path);
+	chmod(path, 0660);
+	link->bound = lstat(path, &st) == 0;
+	if (link->bound) {
+		link->dev = st.st_dev;
+		link->ino = st.st_ino;
+	}
+	return 0;
+}
+
+/* "127.x.y.z", "[::1]" or "localhost", without a resolver that could block. */
+static int loopback(const char *text, struct sockaddr_storage *ret, socklen_t *ret_len)
+{
+	const char *colon = strrchr(text, ':');
+	struct sockaddr_in *v4 = (struct sockaddr_in *)ret;
+	struct sockaddr_in6 *v6 = (struct sockaddr_in6 *)ret;
+	char host[64], *end;
+	unsigned long port = colon ? strtoul(colon + 1, &end, 10) : 0;
+
+	if (!colon || end == colon + 1 || *end || port > 65535 || (size_t)(colon - text) >= sizeof host)
+		return -EINVAL;
+	memset(ret, 0, sizeof *ret);
+	snprintf(host, sizeof host, "%.*s", (int)(colon - text), text);
+	if (!strcmp(host, "[::1]")) {
+		*v6 = (struct sockaddr_in6){
+		    .sin6_family = AF_INET6, .sin6_port = htons((uint16_t)port), .sin6_addr = in6addr_loopback};
+		*ret_len = sizeof *v6;
+		return 0;
+	}
+	*v4 = (struct sockaddr_in){.sin_family = AF_INET, .sin_port = htons((uint16_t)port)};
+	*ret_len = sizeof *v4;
+	if (inet_pton(AF_INET, strcmp(host, "localhost") ? host : "127.0.0.1", &v4->sin_addr) != 1)
+		return -EINVAL;
+	return ntohl(v4->sin_addr.s_addr) >> 24 == 127 ? 0 : -EINVAL;
+}
+
+static int open_udp(struct link *link, const char *text, char error[160])
+{
+	struct sockaddr_storage address;
+	socklen_t len;
+
+	if (loopback(text, &address, &len) < 0) {
+		snprintf(error, 160, "udp:%.40s: poses are taken on loopback only; use udp:127.0.0.1:PORT or unix:PATH",
+		         text);
+		return -1;
+	}
+	link->fd = socket(address.ss_family, SOCK_DGRAM | SOCK_NONBLOCK | SOCK_CLOEXEC, 0);
+	if (link->fd < 0 || bind(link->fd, (struct sockaddr *)&address, len) < 0) {
+		snprintf(error, 160, "udp:%.40s: %s", text, strerror(errno));
+		return -1;
+	}
+	return 0;
+}
+
+static void link_close(struct link *link)
+{
+	struct stat st;
+
+	if (!link)
+		return;
+	if (link->bound && lstat(link->path, &st) == 0 && st.st_dev == link->dev && st.st_ino == link->ino)
+		unlink(link->path);
+	if (link->fd >= 0)
+		close(link->fd);
+	free(link);
+}
+
+static struct link *link_open(const struct config_device *device, char error[160])
+{
+	struct link *link = calloc(1, sizeof *link);
+	int r = 0;
+
+	if (!link) {
+		snprintf(error, 160, "out of memory");
+		return NULL;
+	}
+	link->fd = -1;
+	if (device->fixed)
+		return link;
+	if (!strncmp(device->listen, "unix:", 5)) {
+		r = open_unix(link, device->listen + 5, error);
+	} else if (!strncmp(device->listen, "udp:", 4)) {
+		r = open_udp(link, device->listen + 4, error);
+	} else {
+		snprintf(error, 160, "%.60s is neither unix:PATH nor udp:HOST:PORT", device->listen);
+		r = -1;
+	}
+	if (!r)
+		return link;
+	link_close(link);
+	return NULL;
+}
+
+static int link_fd(const struct link *link)
+{
+	return link->fd;
+}
+
+/* One datagram; empty ones say nothing and are passed over. A longer one than `cap` arrives cut, and is refused as such. */
+static ssize_t link_read(struct link *link, uint8_t *buf, size_t cap, int64_t *t_ns)
+{
+	ssize_t n = 0;
+
+	(void)t_ns;
+	for (int i = 0; i < 16 && n == 0; i++) {
+		n = recv(link->fd, buf, cap, 0);
+		if (n < 0)
+			return errno == EAGAIN || errno == EINTR ? 0 : -errno;
+	}
+	return n;
+}
+
+static ssize_t link_write(struct link *link, const uint8_t *bytes, size_t len)
+{
+	(void)link;
+	(void)bytes;
+	return (ssize_t)len; /* nobody to tell */
+}
+
+const struct driver driver_pose = {
+    .name = "pose",
+    .role = ROLE_POSE,
+    .decoder_create = decoder_create,
+    .decoder_destroy = decoder_destroy,
+    .decode = decode,
+    .counters = counters,
+    .link_open = link_open,
+    .link_fd = link_fd,
+    .link_read = link_read,
+    .link_write = link_write,
+    .link_close = link_close,
+};

@@ -94,19 +94,40 @@ static int errno_of_modbus(void)
 	return errno ? errno : EIO;
 }
 
-/* What libmodbus' select() cannot watch it would write beyond its set; what another program holds is not ours. */
+static void sleep_until(int64_t t_ns)
+{
+	struct timespec ts = {.tv_sec = t_ns / 1000000000, .tv_nsec = t_ns % 1000000000};
+
+	while (clock_nanosleep(CLOCK_MONOTONIC, TIMER_ABSTIME, &ts, NULL) == EINTR)
+		continue;
+}
+
+/* What another program holds is not ours; the thread of a link just closed may need a moment to let go. */
+static int lock_line(int fd)
+{
+	for (int i = 0; i < 60; i++) {
+		if (flock(fd, LOCK_EX | LOCK_NB) == 0)
+			return 0;
+		sleep_until(monotonic_ns() + 10000000);
+	}
+	return -EBUSY;
+}
+
+/* A descriptor beyond FD_SETSIZE would be written outside the set that libmodbus gives to select(). */
 static int claim(struct bus *bus)
 {
 	int fd = modbus_get_socket(bus->modbus);
+	int r;
 
 	if (fd < 0 || fd >= FD_SETSIZE)
 		return -EMFILE;
 	fcntl(fd, F_SETFD, FD_CLOEXEC);
-	if (bus->serial && flock(fd, LOCK_EX | LOCK_NB) < 0)
-		return -EBUSY;
-	if (bus->serial)
+	if (!bus->serial)
+		return 0;
+	r = lock_line(fd);
+	if (!r)
 		modbus_flush(bus->modbus); /* bytes from before are nobody's answer */
-	return 0;
+	return r;
 }
 
 static int bus_connect(struct bus *bus)
@@ -140,14 +161,6 @@ static void bus_disconnect(struct bus *bus)
 	modbus_close(bus->modbus);
 	modbus_free(bus->modbus);
 	bus->modbus = NULL;
-}
-
-static void sleep_until(int64_t t_ns)
-{
-	struct timespec ts = {.tv_sec = t_ns / 1000000000, .tv_nsec = t_ns % 1000000000};
-
-	while (clock_nanosleep(CLOCK_MONOTONIC, TIMER_ABSTIME, &ts, NULL) == EINTR)
-		continue;
 }
 
 /* Reads away what still comes, until the line was silent for a response time; at most ten of them. */

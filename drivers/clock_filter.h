@@ -6,18 +6,29 @@
 #include <stdbool.h>
 #include <stdint.h>
 
+#define CLOCK_FILTER_PHASES 8
+
 struct clock_filter {
-	int64_t period_ns;     /* of the mirror: telegrams end a whole number of these apart */
+	int64_t period_ns; /* of the mirror: telegrams end a whole number of these apart */
 	bool started;
-	int64_t last_ns;       /* filtered time of the last arrival */
-	int64_t envelope_ns;   /* phase: how much later than the least delayed arrival the grid stands; see .c */
+	int64_t last_ns; /* filtered time of the last arrival; the grid of possible times is this plus whole periods */
 	int64_t last_arrival_ns;
+	int steady; /* telegrams running that followed without a gap */
+	int late;   /* telegrams running that came a period or more after their time */
+	/* A stream with gaps: how far the last arrivals were behind the grid, 0 .. period. */
+	int64_t phase_ns[CLOCK_FILTER_PHASES];
+	int phases, oldest;
+	/* A steady stream: the least delays of this and the previous run of telegrams. */
+	int64_t least_ns[2];
+	int counted;
 };
 
 void clock_filter_init(struct clock_filter *, int64_t period_ns);
 
-/* Filtered time of a telegram that arrived at `arrival_ns` and took `turns` periods (1, 2, 4) to measure. Strictly increasing by
- * at least `turns` periods within a stream; never later than the arrival; starts anew after a gap of 2 s. */
+/* Filtered time of a telegram that arrived at `arrival_ns` and took `turns` periods (1, 2, 4) to measure. Strictly
+ * increasing and never later than the arrival (but by a nanosecond, where several arrive at once and nothing is known
+ * yet); `turns` periods or more apart, less what a telegram that was quicker than all before it shows of their delay.
+ * Starts anew after a gap of 2 s. */
 int64_t clock_filter_stamp(struct clock_filter *, int64_t arrival_ns, int turns);
 
 #endif

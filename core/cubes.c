@@ -19,8 +19,7 @@
 #include <errno.h>
 #include <string.h>
 
-#define ROWS          (WINDOW_SIDE * WINDOW_SIDE)
-#define PARAMETER_MIN 4 /* 1/64 of an edge */
+#define ROWS (WINDOW_SIDE * WINDOW_SIDE)
 
 /* Bits of a row: corner i is bit i + WINDOW_LOW. */
 #define CORNERS_FILLED (((1u << (PATCH_SIDE + 3)) - 1) << (WINDOW_LOW - 1)) /* -1 .. 17 */
@@ -365,14 +364,6 @@ static void list_cells(struct extraction *x, const uint32_t *known, const uint32
 		}
 }
 
-/* Where the surface crosses the edge between two corners of different sign, in lattice units from the first. */
-static int edge_parameter(int a, int b)
-{
-	uint32_t near = (uint32_t)(a < 0 ? -a : a), far = (uint32_t)(b < 0 ? -b : b), sum = near + far;
-	int t = (int)((near * LATTICE + sum / 2) / sum);
-	return t < PARAMETER_MIN ? PARAMETER_MIN : t > LATTICE - PARAMETER_MIN ? LATTICE - PARAMETER_MIN : t;
-}
-
 /* Edge e of a cube: the lower corner's offset and the axis (cubes_table.c). */
 static const uint8_t edge_corner[12][3] = {{0, 0, 0}, {0, 1, 0}, {0, 0, 1}, {0, 1, 1}, {0, 0, 0}, {1, 0, 0},
                                            {0, 0, 1}, {1, 0, 1}, {0, 0, 0}, {1, 0, 0}, {0, 1, 0}, {1, 1, 0}};
@@ -384,7 +375,7 @@ static uint32_t make_vertex(struct extraction *x, struct surface *surface, const
 	uint32_t v = surface->nv++;
 	for (int a = 0; a < 3; a++)
 		surface->vertex[v][a] = (uint16_t)(at[a] * LATTICE);
-	surface->vertex[v][axis] += (uint16_t)edge_parameter(value[0], value[step[axis]]);
+	surface->vertex[v][axis] += (uint16_t)cubes_edge_parameter(value[0], value[step[axis]]);
 	surface->name[v] = name;
 	x->index[name] = (uint16_t)(v + 1);
 	return v;

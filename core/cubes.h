@@ -9,8 +9,8 @@
 #include "core/arena.h"
 #include "core/grid.h"
 
-#define WINDOW_LOW 2                                   /* corners below the patch */
-#define WINDOW_SIDE (PATCH_SIDE + 5)                   /* corners -2 .. 18 */
+#define WINDOW_LOW    2                /* corners below the patch */
+#define WINDOW_SIDE   (PATCH_SIDE + 5) /* corners -2 .. 18 */
 #define WINDOW_VOXELS (WINDOW_SIDE * WINDOW_SIDE * WINDOW_SIDE)
 
 /* Corner values of a patch and its halo; index with window_at.
@@ -38,6 +38,16 @@ static inline bool corner_inside(int16_t value)
 /* A cell is complete when its 8 corners are known. -1 .. 16 in each coordinate. */
 bool window_cell_complete(const struct window *, int i, int j, int k);
 
+#define PARAMETER_MIN 4 /* 1/64 of an edge */
+
+/* Where the surface crosses the edge between two corners of different sign, in lattice units from the first. */
+static inline int cubes_edge_parameter(int a, int b)
+{
+	uint32_t near = (uint32_t)(a < 0 ? -a : a), far = (uint32_t)(b < 0 ? -b : b), sum = near + far;
+	int t = (int)((near * LATTICE + sum / 2) / sum);
+	return t < PARAMETER_MIN ? PARAMETER_MIN : t > LATTICE - PARAMETER_MIN ? LATTICE - PARAMETER_MIN : t;
+}
+
 /* Name of a vertex in its patch: the lower corner (0..16 each) and the axis of the grid edge. */
 static inline uint32_t vertex_name(int i, int j, int k, int axis)
 {
@@ -49,9 +59,9 @@ static inline uint32_t vertex_name(int i, int j, int k, int axis)
 struct surface {
 	uint32_t nv, nt;
 	uint16_t (*vertex)[3];
-	uint32_t *name;         /* [nv] vertex_name, raw meshes only; NULL after the reduction */
+	uint32_t *name; /* [nv] vertex_name, raw meshes only; NULL after the reduction */
 	uint32_t (*triangle)[3];
-	uint32_t *plane;        /* [nt] id of the planar region, local to the patch, or UINT32_MAX; NULL: none */
+	uint32_t *plane; /* [nt] id of the planar region, local to the patch, or UINT32_MAX; NULL: none */
 };
 
 void cubes_gather(const struct grid *, struct patch_key, struct window *ret);

@@ -13,13 +13,13 @@ struct reduce_params {
 };
 
 struct reduce_stats {
-	uint64_t regions, regions_kept;       /* planar regions, and those left as they were */
+	uint64_t regions, regions_kept; /* planar regions, and those left as they were */
 	uint64_t border_collapsed, border_relaxed, border_ears, border_merged; /* how border vertices went */
-	double dropped_area;                  /* of specks, in square cells */
+	double dropped_area;                                                   /* of specks, in square cells */
 };
 
 /* `raw` is the surface of `window` (unchanged); all memory comes from `arena`. 0, or -ENOMEM. `stats` is added to. */
-int reduce_surface(const struct window *window, const struct surface *raw, const struct reduce_params *, struct arena *arena,
-                   struct reduce_stats *stats, struct surface *ret);
+int reduce_surface(const struct window *window, const struct surface *raw, const struct reduce_params *,
+                   struct arena *arena, struct reduce_stats *stats, struct surface *ret);
 
 #endif

@@ -1,0 +1,273 @@
+/* The half-edge mesh. Invariants, all asserted by halfedge_check:
+ *
+ *   - a triangle is whole or removed; its three corners differ;
+ *   - each half-edge of a whole triangle is in the list of its origin exactly once, no other is in a list;
+ *   - no two half-edges have the same origin and target;
+ *   - twins point at each other and run in opposite directions;
+ *   - a half-edge without a twin has no opposite half-edge anywhere.
+ *
+ * So an edge never has more than two faces. A vertex may have several fans; the list holds all of them. */
+#include "core/halfedge.h"
+
+#include <assert.h>
+#include <errno.h>
+
+static void unlist(struct halfedge_mesh *mesh, uint32_t h)
+{
+	uint32_t *at = &mesh->first[mesh->origin[h]];
+	while (*at != h)
+		at = &mesh->next_leaving[*at];
+	*at = mesh->next_leaving[h];
+}
+
+static void enlist(struct halfedge_mesh *mesh, uint32_t h)
+{
+	uint32_t v = mesh->origin[h];
+	mesh->next_leaving[h] = mesh->first[v];
+	mesh->first[v] = h;
+}
+
+static void join(struct halfedge_mesh *mesh, uint32_t g, uint32_t h)
+{
+	if (g != HALFEDGE_NONE)
+		mesh->twin[g] = h;
+	if (h != HALFEDGE_NONE)
+		mesh->twin[h] = g;
+}
+
+uint32_t halfedge_find(const struct halfedge_mesh *mesh, uint32_t a, uint32_t b)
+{
+	HALFEDGE_EACH(mesh, h, a)
+	{
+		if (halfedge_target(mesh, h) == b)
+			return h;
+	}
+	return HALFEDGE_NONE;
+}
+
+bool halfedge_joined(const struct halfedge_mesh *mesh, uint32_t a, uint32_t b)
+{
+	HALFEDGE_EACH(mesh, h, a)
+	{
+		if (halfedge_target(mesh, h) == b || mesh->origin[halfedge_previous(h)] == b)
+			return true;
+	}
+	return false;
+}
+
+uint32_t halfedge_border_from(const struct halfedge_mesh *mesh, uint32_t v)
+{
+	HALFEDGE_EACH(mesh, h, v)
+	{
+		if (mesh->twin[h] == HALFEDGE_NONE)
+			return h;
+	}
+	return HALFEDGE_NONE;
+}
+
+uint32_t halfedge_border_into(const struct halfedge_mesh *mesh, uint32_t v)
+{
+	HALFEDGE_EACH(mesh, h, v)
+	{
+		if (mesh->twin[halfedge_previous(h)] == HALFEDGE_NONE)
+			return halfedge_previous(h);
+	}
+	return HALFEDGE_NONE;
+}
+
+uint32_t halfedge_valence(const struct halfedge_mesh *mesh, uint32_t v)
+{
+	uint32_t n = 0;
+	HALFEDGE_EACH(mesh, h, v)
+	n++;
+	return n;
+}
+
+void halfedge_add(struct halfedge_mesh *mesh, uint32_t slot, uint32_t a, uint32_t b, uint32_t c)
+{
+	assert(slot <= mesh->nt && slot < mesh->cap_nt);
+	if (slot == mesh->nt)
+		mesh->nt++;
+	uint32_t corner[3] = {a, b, c};
+	for (uint32_t k = 0; k < 3; k++) {
+		mesh->origin[3 * slot + k] = corner[k];
+		enlist(mesh, 3 * slot + k);
+	}
+	for (uint32_t k = 0; k < 3; k++)
+		join(mesh, 3 * slot + k, halfedge_find(mesh, corner[(k + 1) % 3], corner[k]));
+}
+
+void halfedge_remove(struct halfedge_mesh *mesh, uint32_t triangle)
+{
+	for (uint32_t h = 3 * triangle; h < 3 * triangle + 3; h++) {
+		if (mesh->twin[h] != HALFEDGE_NONE)
+			mesh->twin[mesh->twin[h]] = HALFEDGE_NONE;
+		unlist(mesh, h);
+	}
+	for (uint32_t h = 3 * triangle; h < 3 * triangle + 3; h++)
+		mesh->origin[h] = mesh->twin[h] = HALFEDGE_NONE;
+}
+
+static int reserve(const struct surface *surface, uint32_t spare, struct arena *arena, struct halfedge_mesh *ret)
+{
+	uint32_t cap_nt = surface->nt + spare;
+	*ret = (struct halfedge_mesh){.nv = surface->nv, .cap_nt = cap_nt};
+	ret->position = arena_alloc(arena, surface->nv, sizeof *ret->position);
+	ret->first = ARENA_NEW(arena, uint32_t, surface->nv);
+	ret->mark = ARENA_NEW(arena, uint32_t, surface->nv);
+	ret->origin = ARENA_NEW(arena, uint32_t, 3 * (size_t)cap_nt);
+	ret->twin = ARENA_NEW(arena, uint32_t, 3 * (size_t)cap_nt);
+	ret->next_leaving = ARENA_NEW(arena, uint32_t, 3 * (size_t)cap_nt);
+	return ret->position && ret->first && ret->mark && ret->origin && ret->twin && ret->next_leaving ? 0 : -ENOMEM;
+}
+
+int halfedge_build(const struct surface *surface, uint32_t spare, struct arena *arena, struct halfedge_mesh *ret)
+{
+	struct halfedge_mesh mesh;
+	int r = reserve(surface, spare, arena, &mesh);
+	if (r)
+		return r;
+	for (uint32_t v = 0; v < mesh.nv; v++) {
+		mesh.first[v] = HALFEDGE_NONE;
+		for (int axis = 0; axis < 3; axis++)
+			mesh.position[v][axis] = surface->vertex[v][axis];
+	}
+	for (uint32_t t = 0; t < surface->nt; t++) {
+		const uint32_t *corner = surface->triangle[t];
+		for (uint32_t k = 0; k < 3; k++) {
+			uint32_t a = corner[k], b = corner[(k + 1) % 3];
+			if (a == b || a >= mesh.nv || b >= mesh.nv || halfedge_find(&mesh, a, b) != HALFEDGE_NONE)
+				return -EINVAL;
+		}
+		halfedge_add(&mesh, t, corner[0], corner[1], corner[2]);
+	}
+	*ret = mesh;
+	return 0;
+}
+
+void halfedge_mark_ring(struct halfedge_mesh *mesh, uint32_t v)
+{
+	mesh->stamp++;
+	HALFEDGE_EACH(mesh, h, v)
+	{
+		mesh->mark[halfedge_target(mesh, h)] = mesh->stamp;
+		mesh->mark[mesh->origin[halfedge_previous(h)]] = mesh->stamp;
+	}
+}
+
+/* Marked neighbours of v; takes their marks away, so that none counts twice. */
+static uint32_t count_marked(struct halfedge_mesh *mesh, uint32_t v)
+{
+	uint32_t n = 0;
+	HALFEDGE_EACH(mesh, h, v)
+	{
+		uint32_t ring[2] = {halfedge_target(mesh, h), mesh->origin[halfedge_previous(h)]};
+		for (int k = 0; k < 2; k++)
+			if (mesh->mark[ring[k]] == mesh->stamp) {
+				mesh->mark[ring[k]] = 0;
+				n++;
+			}
+	}
+	return n;
+}
+
+/* The triangle of h would go; its two other edges become one, which must not be left without any face. */
+static bool leaves_neighbour(const struct halfedge_mesh *mesh, uint32_t h)
+{
+	return mesh->twin[halfedge_next(h)] != HALFEDGE_NONE || mesh->twin[halfedge_previous(h)] != HALFEDGE_NONE;
+}
+
+bool halfedge_may_collapse(struct halfedge_mesh *mesh, uint32_t h, uint32_t v)
+{
+	uint32_t u = halfedge_other(mesh, h, v), g = mesh->twin[h];
+	if (!leaves_neighbour(mesh, h) || (g != HALFEDGE_NONE && !leaves_neighbour(mesh, g)))
+		return false;
+	uint32_t valence = 0;
+	bool border = false;
+	HALFEDGE_EACH(mesh, e, v)
+	{
+		valence++;
+		border |= mesh->twin[e] == HALFEDGE_NONE;
+	}
+	if (border && g != HALFEDGE_NONE)
+		return false;
+	halfedge_mark_ring(mesh, u);
+	if (count_marked(mesh, v) != (g == HALFEDGE_NONE ? 1u : 2u))
+		return false;
+	if (border || valence != 3)
+		return true;
+	/* The three triangles become one, which must not be there already. */
+	uint32_t x = mesh->origin[halfedge_previous(h)], y = mesh->origin[halfedge_previous(g)];
+	uint32_t e = halfedge_find(mesh, u, x), f = halfedge_find(mesh, x, u);
+	return (e == HALFEDGE_NONE || mesh->origin[halfedge_previous(e)] != y) &&
+	       (f == HALFEDGE_NONE || mesh->origin[halfedge_previous(f)] != y);
+}
+
+static void drop(struct halfedge_mesh *mesh, uint32_t h)
+{
+	uint32_t triangle = h / 3;
+	join(mesh, mesh->twin[halfedge_next(h)], mesh->twin[halfedge_previous(h)]);
+	for (uint32_t e = 3 * triangle; e < 3 * triangle + 3; e++)
+		unlist(mesh, e);
+	for (uint32_t e = 3 * triangle; e < 3 * triangle + 3; e++)
+		mesh->origin[e] = mesh->twin[e] = HALFEDGE_NONE;
+}
+
+void halfedge_collapse(struct halfedge_mesh *mesh, uint32_t h, uint32_t v)
+{
+	uint32_t u = halfedge_other(mesh, h, v), g = mesh->twin[h];
+	drop(mesh, h);
+	if (g != HALFEDGE_NONE)
+		drop(mesh, g);
+	for (uint32_t e = mesh->first[v]; e != HALFEDGE_NONE;) {
+		uint32_t next = mesh->next_leaving[e];
+		mesh->origin[e] = u;
+		enlist(mesh, e);
+		e = next;
+	}
+	mesh->first[v] = HALFEDGE_NONE;
+}
+
+static const char *check_triangle(const struct halfedge_mesh *mesh, uint32_t t)
+{
+	for (uint32_t h = 3 * t; h < 3 * t + 3; h++) {
+		uint32_t a = mesh->origin[h], b = halfedge_target(mesh, h), listed = 0;
+		if (a >= mesh->nv || b >= mesh->nv || a == b)
+			return "a corner is out of range or repeated";
+		HALFEDGE_EACH(mesh, e, a)
+		{
+			listed += e == h;
+			if (e != h && halfedge_target(mesh, e) == b)
+				return "two half-edges run the same way";
+		}
+		if (listed != 1)
+			return "a half-edge is not once in the list of its origin";
+		uint32_t g = mesh->twin[h];
+		if (g != halfedge_find(mesh, b, a))
+			return "a twin is not the opposite half-edge";
+		if (g != HALFEDGE_NONE && mesh->twin[g] != h)
+			return "twins do not point at each other";
+	}
+	return NULL;
+}
+
+const char *halfedge_check(const struct halfedge_mesh *mesh)
+{
+	uint32_t listed = 0, whole = 0;
+	for (uint32_t t = 0; t < mesh->nt; t++) {
+		if (!halfedge_alive(mesh, t))
+			continue;
+		const char *wrong = check_triangle(mesh, t);
+		if (wrong)
+			return wrong;
+		whole++;
+	}
+	for (uint32_t v = 0; v < mesh->nv; v++)
+		HALFEDGE_EACH(mesh, h, v)
+		{
+			if (mesh->origin[h] != v || listed > 3 * whole)
+				return "a list holds a half-edge of another vertex";
+			listed++;
+		}
+	return listed == 3 * whole ? NULL : "a list holds a half-edge of a removed triangle";
+}

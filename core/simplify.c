@@ -1,0 +1,456 @@
+/* Half-edge collapses, cheapest first.
+ *
+ * A vertex waits in a heap under the cost of its best target; when its turn comes its targets are tried from the
+ * cheapest on, and one that the guards or the exact test refuse hands the turn back under the cost of the next. A
+ * collapse gives the vertices around it a new turn. Ties go to the smaller index: the order is total.
+ *
+ * The cost of moving v into u is the mean squared distance of u to the planes both stand for, at most the tolerance
+ * squared, plus a little of the length of the way, so that flat parts shrink evenly. The exact test of law L5 asks more:
+ * each raw vertex in the lists of the triangles of v, and v itself, must lie within the tolerance of a triangle that
+ * stays, and goes to the list of the nearest one.
+ *
+ * A vertex of an open rim moves along the rim only. What goes from a rim is kept in the list of the rim's half-edge: it
+ * may lie half a cell from the new edge sideways, and the tolerance from the plane of the nearest triangle. No vertex of any
+ * rim may come to lie on the new edge: that would be a crack of no width. */
+#include "core/simplify.h"
+
+#include <assert.h>
+#include <errno.h>
+#include <string.h>
+
+#include "core/guard.h"
+#include "core/predicates.h"
+
+#define COSINE_TURN  0.30901699437494742 /* 72 degrees */
+#define VALENCE_MAX  24
+#define FLATS_MAX    256   /* triangles at a vertex before that */
+#define RIM_SIDEWAYS 0.5   /* cells */
+#define RIM_GAP      5     /* lattice units a rim vertex keeps from other rim edges, 0.02 cell */
+#define LENGTH_SHARE 0.002 /* of the squared way, in the cost */
+
+struct target {
+	double cost;
+	uint32_t u, h;
+};
+
+struct pass {
+	struct simplify *s;
+	uint32_t *heap, *place, n; /* place [nv] in the heap, or UINT32_MAX */
+	double *key;               /* [nv] */
+	uint8_t *tried;            /* [nv] targets refused since the last change around */
+	uint32_t *rim, rims;       /* vertices that were on a border at the start */
+	struct flat flat[FLATS_MAX];
+	uint32_t flat_triangle[FLATS_MAX], flats;
+	uint32_t *point, *point_triangle, points; /* where the exact test puts the points */
+};
+
+int simplify_init(struct simplify *s, const struct surface *raw, const struct border *border, double tolerance,
+                  struct arena *arena)
+{
+	*s = (struct simplify){.border = *border};
+	int r = halfedge_build(raw, border->members, arena, &s->mesh);
+	if (r == -ENOMEM)
+		return r;
+	assert(r == 0); /* marching cubes gives no edge more than two faces */
+	uint32_t cap_nt = s->mesh.cap_nt;
+	s->origin = ARENA_NEW(arena, struct vec3, raw->nv);
+	s->quadric = ARENA_NEW(arena, struct quadric, raw->nv);
+	s->fixed = ARENA_NEW(arena, bool, raw->nv);
+	s->next_point = ARENA_NEW(arena, uint32_t, raw->nv);
+	s->points = ARENA_NEW(arena, uint32_t, cap_nt);
+	s->plane = ARENA_NEW(arena, uint32_t, cap_nt);
+	s->rim_points = ARENA_NEW(arena, uint32_t, 3 * (size_t)cap_nt);
+	if (!s->origin || !s->quadric || !s->fixed || !s->next_point || !s->points || !s->plane || !s->rim_points)
+		return -ENOMEM;
+	memset(s->points, 0xff, cap_nt * sizeof *s->points);
+	memset(s->plane, 0xff, cap_nt * sizeof *s->plane);
+	memset(s->rim_points, 0xff, 3 * (size_t)cap_nt * sizeof *s->rim_points);
+	s->tolerance_squared = tolerance * tolerance * LATTICE * LATTICE;
+	s->rim_squared = RIM_SIDEWAYS * RIM_SIDEWAYS * LATTICE * LATTICE;
+	for (uint32_t v = 0; v < raw->nv; v++)
+		s->origin[v] = simplify_place(s, v);
+	for (uint32_t t = 0; t < raw->nt; t++) {
+		const uint32_t *corner = raw->triangle[t];
+		struct vec3 a = s->origin[corner[0]], b = s->origin[corner[1]], c = s->origin[corner[2]];
+		struct vec3 normal = vec3_cross(vec3_sub(b, a), vec3_sub(c, a));
+		double length = vec3_norm(normal);
+		if (length == 0)
+			continue;
+		double unit[3] = {normal.x / length, normal.y / length, normal.z / length}, at[3] = {a.x, a.y, a.z};
+		for (int k = 0; k < 3; k++)
+			quadric_add_plane(&s->quadric[corner[k]], unit, at, 1);
+	}
+	return 0;
+}
+
+void simplify_settle(struct simplify *s)
+{
+	for (uint32_t v = 0; v < s->mesh.nv; v++) {
+		uint32_t borders = 0;
+		HALFEDGE_EACH(&s->mesh, h, v)
+		borders += s->mesh.twin[h] == HALFEDGE_NONE;
+		uint8_t kind = s->border.kind[v];
+		s->fixed[v] = kind == BORDER_CHAIN || kind == BORDER_PINNED || borders > 1;
+	}
+}
+
+/* The heap of vertices, by key, then by index. */
+static bool earlier(const struct pass *pass, uint32_t v, uint32_t w)
+{
+	return pass->key[v] < pass->key[w] || (pass->key[v] == pass->key[w] && v < w);
+}
+
+static void put(struct pass *pass, uint32_t at, uint32_t v)
+{
+	pass->heap[at] = v;
+	pass->place[v] = at;
+}
+
+static void sift_up(struct pass *pass, uint32_t at, uint32_t v)
+{
+	while (at && earlier(pass, v, pass->heap[(at - 1) / 2])) {
+		put(pass, at, pass->heap[(at - 1) / 2]);
+		at = (at - 1) / 2;
+	}
+	put(pass, at, v);
+}
+
+static void sift_down(struct pass *pass, uint32_t at, uint32_t v)
+{
+	for (;;) {
+		uint32_t child = 2 * at + 1;
+		if (child >= pass->n)
+			break;
+		if (child + 1 < pass->n && earlier(pass, pass->heap[child + 1], pass->heap[child]))
+			child++;
+		if (!earlier(pass, pass->heap[child], v))
+			break;
+		put(pass, at, pass->heap[child]);
+		at = child;
+	}
+	put(pass, at, v);
+}
+
+static void heap_remove(struct pass *pass, uint32_t v)
+{
+	uint32_t at = pass->place[v];
+	if (at == UINT32_MAX)
+		return;
+	pass->place[v] = UINT32_MAX;
+	uint32_t last = pass->heap[--pass->n];
+	if (last == v)
+		return;
+	if (at && earlier(pass, last, pass->heap[(at - 1) / 2]))
+		sift_up(pass, at, last);
+	else
+		sift_down(pass, at, last);
+}
+
+static void heap_set(struct pass *pass, uint32_t v, double key)
+{
+	heap_remove(pass, v);
+	pass->key[v] = key;
+	sift_up(pass, pass->n++, v);
+}
+
+/* Cost of moving v into u, or a negative number where the mean quadric is beyond the tolerance. */
+static double cost_of(const struct simplify *s, uint32_t v, uint32_t u)
+{
+	const int32_t *to = s->mesh.position[u];
+	const double at[3] = {to[0], to[1], to[2]};
+	double sum = quadric_at(&s->quadric[v], at) + quadric_at(&s->quadric[u], at);
+	double mean = sum / (s->quadric[v].planes + s->quadric[u].planes);
+	if (mean > s->tolerance_squared)
+		return -1;
+	return (mean > 0 ? mean : 0) + LENGTH_SHARE * (double)distance_squared3(s->mesh.position[v], to);
+}
+
+static void add_target(const struct simplify *s, uint32_t v, uint32_t h, struct target *target, uint32_t *n)
+{
+	uint32_t u = halfedge_other(&s->mesh, h, v);
+	double cost = cost_of(s, v, u);
+	if (cost < 0 || *n == VALENCE_MAX)
+		return;
+	uint32_t k = (*n)++;
+	while (k && (target[k - 1].cost > cost || (target[k - 1].cost == cost && target[k - 1].u > u))) {
+		target[k] = target[k - 1];
+		k--;
+	}
+	target[k] = (struct target){cost, u, h};
+}
+
+/* Where v may go, cheapest first. */
+static uint32_t find_targets(const struct simplify *s, uint32_t v, struct target *target)
+{
+	const struct halfedge_mesh *mesh = &s->mesh;
+	uint32_t n = 0, from = halfedge_border_from(mesh, v);
+	if (from != HALFEDGE_NONE) {
+		add_target(s, v, from, target, &n);
+		add_target(s, v, halfedge_border_into(mesh, v), target, &n);
+		return n;
+	}
+	HALFEDGE_EACH(mesh, h, v)
+	add_target(s, v, h, target, &n);
+	return n;
+}
+
+static void give_turn(struct pass *pass, uint32_t v)
+{
+	struct target target[VALENCE_MAX];
+	if (pass->s->fixed[v] || pass->s->mesh.first[v] == HALFEDGE_NONE)
+		return;
+	pass->tried[v] = 0;
+	if (find_targets(pass->s, v, target))
+		heap_set(pass, v, target[0].cost);
+	else
+		heap_remove(pass, v);
+}
+
+/* The triangles that stay when v moves into u, as they then lie; where none does, the one behind h's tip. */
+static void make_flats(struct pass *pass, uint32_t v, uint32_t u, uint32_t h)
+{
+	const struct simplify *s = pass->s;
+	const struct halfedge_mesh *mesh = &s->mesh;
+	pass->flats = 0;
+	HALFEDGE_EACH(mesh, e, v)
+	{
+		uint32_t x = halfedge_target(mesh, e), y = mesh->origin[halfedge_previous(e)];
+		if (x == u || y == u)
+			continue;
+		pass->flat_triangle[pass->flats] = e / 3;
+		pass->flat[pass->flats++] = flat_make(simplify_place(s, u), simplify_place(s, x), simplify_place(s, y));
+	}
+	if (pass->flats)
+		return;
+	uint32_t next = mesh->twin[halfedge_next(h)], previous = mesh->twin[halfedge_previous(h)];
+	uint32_t t = (next != HALFEDGE_NONE ? next : previous) / 3;
+	pass->flat_triangle[0] = t;
+	pass->flat[0] = flat_make(simplify_place(s, mesh->origin[3 * t]), simplify_place(s, mesh->origin[3 * t + 1]),
+	                          simplify_place(s, mesh->origin[3 * t + 2]));
+	pass->flats = 1;
+}
+
+static uint32_t nearest_flat(const struct pass *pass, struct vec3 p, double *ret_squared)
+{
+	uint32_t best = 0;
+	*ret_squared = INFINITY;
+	for (uint32_t f = 0; f < pass->flats; f++) {
+		double squared = flat_distance_squared(&pass->flat[f], p);
+		if (squared < *ret_squared) {
+			*ret_squared = squared;
+			best = f;
+		}
+	}
+	return best;
+}
+
+static bool place_point(struct pass *pass, uint32_t p)
+{
+	double squared;
+	uint32_t f = nearest_flat(pass, pass->s->origin[p], &squared);
+	if (squared > pass->s->tolerance_squared)
+		return false;
+	pass->point[pass->points] = p;
+	pass->point_triangle[pass->points++] = pass->flat_triangle[f];
+	return true;
+}
+
+/* Of what went from a rim: near a triangle sideways, within the tolerance of its plane. */
+static bool rim_point_near(const struct pass *pass, uint32_t p)
+{
+	double squared;
+	struct vec3 at = pass->s->origin[p];
+	const struct flat *flat = &pass->flat[nearest_flat(pass, at, &squared)];
+	double height = vec3_dot(vec3_sub(at, flat->a), flat->normal);
+	return squared <= pass->s->rim_squared && height * height <= pass->s->tolerance_squared;
+}
+
+static bool points_stay_near(struct pass *pass, uint32_t v, bool rim)
+{
+	const struct simplify *s = pass->s;
+	pass->points = 0;
+	if (!rim && !place_point(pass, v))
+		return false;
+	HALFEDGE_EACH(&s->mesh, h, v)
+	{
+		for (uint32_t p = s->points[h / 3]; p != UINT32_MAX; p = s->next_point[p])
+			if (!place_point(pass, p))
+				return false;
+		for (uint32_t e = h / 3 * 3; e < h / 3 * 3 + 3; e++)
+			for (uint32_t p = s->rim_points[e]; p != UINT32_MAX; p = s->next_point[p])
+				if (!rim_point_near(pass, p))
+					return false;
+	}
+	return true;
+}
+
+/* The border half-edge at v other than h. */
+static uint32_t other_rim_edge(const struct halfedge_mesh *mesh, uint32_t v, uint32_t h)
+{
+	uint32_t from = halfedge_border_from(mesh, v);
+	return from != h ? from : halfedge_border_into(mesh, v);
+}
+
+/* Whether what went from the rim between w, v and u, and v itself, lies near the edge w-u. */
+static bool rim_stays_near(const struct pass *pass, uint32_t v, uint32_t u, uint32_t h)
+{
+	const struct simplify *s = pass->s;
+	uint32_t edge[2] = {h, other_rim_edge(&s->mesh, v, h)}, w = halfedge_other(&s->mesh, edge[1], v);
+	struct vec3 a = simplify_place(s, w), b = simplify_place(s, u);
+	if (segment_distance_squared(a, b, s->origin[v]) > s->rim_squared || !rim_point_near(pass, v))
+		return false;
+	for (int k = 0; k < 2; k++)
+		for (uint32_t p = s->rim_points[edge[k]]; p != UINT32_MAX; p = s->next_point[p])
+			if (segment_distance_squared(a, b, s->origin[p]) > s->rim_squared)
+				return false;
+	return true;
+}
+
+/* Whether no other border vertex lies on the edge a-b, or almost. */
+static bool rim_clear(const struct pass *pass, uint32_t a, uint32_t b, uint32_t v)
+{
+	const struct halfedge_mesh *mesh = &pass->s->mesh;
+	const int32_t *pa = mesh->position[a], *pb = mesh->position[b];
+	int64_t length = distance_squared3(pa, pb);
+	for (uint32_t k = 0; k < pass->rims; k++) {
+		uint32_t c = pass->rim[k];
+		const int32_t *pc = mesh->position[c];
+		if (c == a || c == b || c == v || mesh->first[c] == HALFEDGE_NONE)
+			continue;
+		int64_t from_a = distance_squared3(pa, pc), from_b = distance_squared3(pb, pc), normal[3];
+		if (from_a > length + from_b || from_b > length + from_a)
+			continue;
+		triangle_normal(pa, pb, pc, normal);
+		if (normal[0] * normal[0] + normal[1] * normal[1] + normal[2] * normal[2] <= RIM_GAP * RIM_GAP * length)
+			return false;
+	}
+	return true;
+}
+
+/* Lists of border edges whose triangle goes while the edge stays: they follow the edge to the triangle behind it. */
+static void follow_rims(struct simplify *s, uint32_t h)
+{
+	struct halfedge_mesh *mesh = &s->mesh;
+	uint32_t edge[2] = {halfedge_next(h), halfedge_previous(h)};
+	for (int k = 0; k < 2; k++) {
+		uint32_t heir = mesh->twin[edge[1 - k]];
+		if (mesh->twin[edge[k]] == HALFEDGE_NONE && heir != HALFEDGE_NONE)
+			s->rim_points[heir] = s->rim_points[edge[k]];
+		s->rim_points[edge[k]] = UINT32_MAX;
+	}
+}
+
+/* Joins v and the lists of its two rim edges; returns the list. */
+static uint32_t take_rim(struct simplify *s, uint32_t v, uint32_t h, uint32_t other)
+{
+	uint32_t list = v, edge[2] = {h, other};
+	s->next_point[v] = UINT32_MAX;
+	for (int k = 0; k < 2; k++) {
+		for (uint32_t p = s->rim_points[edge[k]], next; p != UINT32_MAX; p = next) {
+			next = s->next_point[p];
+			s->next_point[p] = list;
+			list = p;
+		}
+		s->rim_points[edge[k]] = UINT32_MAX;
+	}
+	return list;
+}
+
+static void commit(struct pass *pass, uint32_t v, uint32_t u, uint32_t h, bool rim)
+{
+	struct simplify *s = pass->s;
+	struct halfedge_mesh *mesh = &s->mesh;
+	uint32_t list = UINT32_MAX, w = HALFEDGE_NONE, g = mesh->twin[h];
+	if (rim) {
+		uint32_t other = other_rim_edge(mesh, v, h);
+		w = halfedge_other(mesh, other, v);
+		list = take_rim(s, v, h, other);
+	}
+	HALFEDGE_EACH(mesh, e, v)
+	s->points[e / 3] = UINT32_MAX;
+	for (uint32_t k = 0; k < pass->points; k++) {
+		uint32_t t = pass->point_triangle[k];
+		s->next_point[pass->point[k]] = s->points[t];
+		s->points[t] = pass->point[k];
+	}
+	follow_rims(s, h);
+	if (g != HALFEDGE_NONE)
+		follow_rims(s, g);
+	quadric_add(&s->quadric[u], &s->quadric[v]);
+	halfedge_collapse(mesh, h, v);
+	if (rim) {
+		uint32_t e = halfedge_find(mesh, w, u);
+		s->rim_points[e != HALFEDGE_NONE ? e : halfedge_find(mesh, u, w)] = list;
+	}
+}
+
+static bool try_target(struct pass *pass, uint32_t v, const struct target *target)
+{
+	struct simplify *s = pass->s;
+	struct halfedge_mesh *mesh = &s->mesh;
+	uint32_t u = target->u, h = target->h;
+	bool rim = mesh->twin[h] == HALFEDGE_NONE;
+	uint32_t to = halfedge_valence(mesh, u), after = halfedge_valence(mesh, v) + to - (rim ? 2 : 4);
+	if ((after > VALENCE_MAX && after > to) || !halfedge_may_collapse(mesh, h, v) ||
+	    !guard_patch_faces(mesh, s->border.faces, h, v, HALFEDGE_NONE) || !guard_shape(mesh, h, v, COSINE_TURN))
+		return false;
+	make_flats(pass, v, u, h);
+	if (rim && (!rim_stays_near(pass, v, u, h) ||
+	            !rim_clear(pass, halfedge_other(mesh, other_rim_edge(mesh, v, h), v), u, v)))
+		return false;
+	if (!points_stay_near(pass, v, rim))
+		return false;
+	commit(pass, v, u, h, rim);
+	return true;
+}
+
+static void take_turn(struct pass *pass, uint32_t v)
+{
+	struct target target[VALENCE_MAX];
+	uint32_t n = find_targets(pass->s, v, target), k = pass->tried[v];
+	heap_remove(pass, v);
+	if (k >= n)
+		return;
+	if (!try_target(pass, v, &target[k])) {
+		if (++pass->tried[v] < n)
+			heap_set(pass, v, target[k + 1].cost);
+		return;
+	}
+	const struct halfedge_mesh *mesh = &pass->s->mesh;
+	uint32_t u = target[k].u;
+	give_turn(pass, u);
+	HALFEDGE_EACH(mesh, h, u)
+	{
+		give_turn(pass, halfedge_target(mesh, h));
+		if (mesh->twin[halfedge_previous(h)] == HALFEDGE_NONE)
+			give_turn(pass, mesh->origin[halfedge_previous(h)]);
+	}
+}
+
+int simplify_collapse(struct simplify *s, struct arena *arena)
+{
+	uint32_t nv = s->mesh.nv;
+	struct pass *pass = ARENA_NEW(arena, struct pass, 1);
+	if (!pass)
+		return -ENOMEM;
+	pass->s = s;
+	pass->heap = ARENA_NEW(arena, uint32_t, nv);
+	pass->place = ARENA_NEW(arena, uint32_t, nv);
+	pass->key = ARENA_NEW(arena, double, nv);
+	pass->tried = ARENA_NEW(arena, uint8_t, nv);
+	pass->rim = ARENA_NEW(arena, uint32_t, nv);
+	pass->point = ARENA_NEW(arena, uint32_t, nv);
+	pass->point_triangle = ARENA_NEW(arena, uint32_t, nv);
+	if (!pass->heap || !pass->place || !pass->key || !pass->tried || !pass->rim || !pass->point ||
+	    !pass->point_triangle)
+		return -ENOMEM;
+	memset(pass->place, 0xff, nv * sizeof *pass->place);
+	for (uint32_t v = 0; v < nv; v++) {
+		if (halfedge_border_from(&s->mesh, v) != HALFEDGE_NONE)
+			pass->rim[pass->rims++] = v;
+		give_turn(pass, v);
+	}
+	while (pass->n)
+		take_turn(pass, pass->heap[0]);
+	return 0;
+}

@@ -194,14 +194,18 @@ uint64_t mesher_faces_raw(const struct mesher *mesher)
 	return mesher->faces_raw;
 }
 
-/* The surface of the mesher's window. 0 or -ENOMEM. */
-static int mesh_window(struct mesher *mesher, struct surface *ret, uint32_t *ret_raw_faces)
+/* The surface of the mesher's window, reduced if the map wants it. 0 or -ENOMEM. */
+static int mesh_window(const struct map *map, struct mesher *mesher, struct surface *ret, uint32_t *ret_raw_faces)
 {
 	struct surface raw;
 	int r = cubes_extract(&mesher->window, &mesher->arena, &raw);
 	if (r)
 		return r;
 	*ret_raw_faces = raw.nt;
+	if (map->params.reduce) {
+		const struct reduce_params params = {.tolerance = map->params.tolerance};
+		return reduce_surface(&mesher->window, &raw, &params, &mesher->arena, &mesher->stats, ret);
+	}
 	*ret = raw;
 	return 0;
 }
@@ -214,7 +218,7 @@ struct patch *map_mesh_patch(const struct map *map, struct mesher *mesher, struc
 	uint32_t raw_faces = 0;
 	arena_reset(&mesher->arena);
 	cubes_gather(map->grid, key, &mesher->window);
-	if (mesh_window(mesher, &surface, &raw_faces))
+	if (mesh_window(map, mesher, &surface, &raw_faces))
 		return NULL;
 	struct patch *patch = patch_create(key, &surface);
 	if (!patch)

@@ -35,7 +35,8 @@ static inline bool corner_inside(int16_t value)
 	return value < 0;
 }
 
-/* A cell is complete when its 8 corners are known. -1 .. 16 in each coordinate. */
+/* A cell is complete when its 8 corners are known. -1 .. 16 in each coordinate. Ask for cells of both signs only: for
+ * others the answer depends on which of their filled corners were stored. */
 bool window_cell_complete(const struct window *, int i, int j, int k);
 
 #define PARAMETER_MIN 4 /* 1/64 of an edge */

@@ -24,7 +24,6 @@ struct map {
 	struct map_params params;
 	struct grid *grid;
 	struct field *field;
-	uint64_t step;
 	int64_t t_ns;
 	int64_t waiting[WAITING_MAX]; /* a ring */
 	uint32_t waiting_first, waiting_count;
@@ -87,9 +86,6 @@ static void note_applied(struct map *map, int n)
 		map->t_ns = map->waiting[map->waiting_first];
 		map->waiting_first = (map->waiting_first + 1) % WAITING_MAX;
 	}
-	struct field_stats stats;
-	field_stats(map->field, &stats);
-	map->step = stats.step;
 }
 
 int map_row(struct map *map, struct row *row)
@@ -115,7 +111,9 @@ int map_flush(struct map *map)
 
 uint64_t map_step(const struct map *map)
 {
-	return map->step;
+	struct field_stats stats;
+	field_stats(map->field, &stats);
+	return stats.step;
 }
 
 int64_t map_time_ns(const struct map *map)
@@ -224,7 +222,7 @@ struct patch *map_mesh_patch(const struct map *map, struct mesher *mesher, struc
 	if (!patch)
 		return NULL;
 	const struct birth *birth = find_birth(map->birth, map->births_cap, key);
-	patch->version = map->step;
+	patch->version = map_step(map);
 	patch->t_first_ns = birth->used ? birth->t_ns : map->t_ns;
 	patch->t_last_ns = map->t_ns;
 	mesher->faces_raw += raw_faces;

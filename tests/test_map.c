@@ -1,0 +1,321 @@
+/* L2, L3: the patches of a map are a function of its rows, and re-meshing what is dirty is meshing everything. */
+#include <math.h>
+#include <setjmp.h>
+#include <stdarg.h>
+#include <stddef.h>
+#include <stdio.h>
+#include <stdlib.h>
+#include <string.h>
+#include <cmocka.h>
+
+#include "core/map.h"
+#include "tests/soup.h"
+
+#define ROWS  120
+#define BEAMS 181
+
+static struct map *make_map(bool reduce)
+{
+	struct map_params params = {
+	    .cell_m = 0.1, .tolerance = 0.25, .reduce = reduce, .lookahead = 2, .memory = 256 << 20};
+	struct map *map = map_create(&params);
+	assert_non_null(map);
+	return map;
+}
+
+/* Range to a room of 6 x 5 x 3 m seen from 1 m above its floor, off its middle. */
+static double room_range(struct vec3 d)
+{
+	const double low[3] = {-2.5, -3, -1}, high[3] = {3.5, 2, 2}, direction[3] = {d.x, d.y, d.z};
+	double range = 100;
+	for (int a = 0; a < 3; a++) {
+		double wall = direction[a] > 0   ? high[a] / direction[a]
+		              : direction[a] < 0 ? low[a] / direction[a]
+		                                 : 100;
+		range = wall < range ? wall : range;
+	}
+	return range;
+}
+
+/* Row `n` of a sweep of a tilting scanner, with a little noise that depends on the row alone. */
+static struct row *room_row(int n)
+{
+	struct row *row = row_create(BEAMS);
+	double tilt = (-50.0 + n) * 3.14159265358979 / 180;
+	uint64_t noise = (uint64_t)n * 2654435761u + 1;
+	row->number = (uint64_t)n;
+	row->starts_sweep = n == 0;
+	row->t_ns = 1000000000ll + n * 13333333ll;
+	row->tilt_rad = tilt;
+	row->step_rad = 3.14159265358979 / (BEAMS - 1);
+	row->first_rad = -3.14159265358979 / 2;
+	for (int b = 0; b < BEAMS; b++) {
+		double bearing = row->first_rad + b * row->step_rad;
+		struct vec3 d = {cos(bearing) * cos(tilt), sin(bearing), -cos(bearing) * sin(tilt)};
+		noise = noise * 6364136223846793005ull + 1442695040888963407ull;
+		double range = room_range(d) + ((double)(noise >> 40) / (1 << 24) - 0.5) * 0.02;
+		row->beam[b] =
+		    (struct row_beam){.point = vec3_scale(d, range), .range_m = (float)range, .state = BEAM_OK};
+	}
+	return row;
+}
+
+static void mesh_dirty(struct map *map, struct mesher *mesher, struct patch_store *store)
+{
+	const struct patch_key *keys;
+	size_t n = map_take_dirty(map, &keys);
+	for (size_t i = 0; i < n; i++) {
+		struct patch *patch = map_mesh_patch(map, mesher, keys[i], NULL);
+		assert_non_null(patch);
+		assert_int_equal(patch_store_put(store, patch), 0);
+	}
+}
+
+/* The room, meshed every `batch` rows; the map and its patches. */
+static struct map *make_room(bool reduce, int batch, struct mesher *mesher, struct patch_store *store)
+{
+	struct map *map = make_map(reduce);
+	int folded = 0;
+	for (int n = 0; n < ROWS; n++) {
+		folded += map_row(map, room_row(n));
+		if ((n + 1) % batch == 0)
+			mesh_dirty(map, mesher, store);
+	}
+	folded += map_flush(map);
+	mesh_dirty(map, mesher, store);
+	assert_int_equal(folded, ROWS);
+	assert_int_equal(map_step(map), ROWS);
+	return map;
+}
+
+static void hash_of_batches(bool reduce, int batch, char ret_hex[65], size_t *ret_patches, uint64_t *ret_raw)
+{
+	struct mesher *mesher = mesher_create();
+	struct patch_store *store = patch_store_create();
+	struct map *map = make_room(reduce, batch, mesher, store);
+	patch_store_hash(store, ret_hex);
+	*ret_patches = patch_store_count(store);
+	*ret_raw = mesher_faces_raw(mesher);
+	map_destroy(map);
+	mesher_destroy(mesher);
+	patch_store_destroy(store);
+}
+
+static void the_same_rows_give_the_same_patches_however_often_they_are_meshed(void **state)
+{
+	(void)state;
+	for (int reduce = 0; reduce < 2; reduce++) {
+		char all[65], batches[65];
+		size_t patches, again;
+		uint64_t raw, raw_again;
+		hash_of_batches(reduce, ROWS * 2, all, &patches, &raw);
+		assert_true(patches > 20 && raw > 10000);
+		for (int batch = 1; batch <= 10; batch += batch == 1 ? 3 : 6) {
+			hash_of_batches(reduce, batch, batches, &again, &raw_again);
+			assert_string_equal(all, batches);
+			assert_int_equal(patches, again);
+			assert_true(raw_again > raw);
+		}
+	}
+}
+
+static void times_and_versions_are_those_of_the_rows(void **state)
+{
+	(void)state;
+	struct mesher *mesher = mesher_create();
+	struct patch_store *store = patch_store_create();
+	struct map *map = make_room(false, 10, mesher, store);
+	const int64_t t0 = room_row(0)->t_ns, t_end = t0 + (ROWS - 1) * 13333333ll;
+	assert_int_equal(map_time_ns(map), t_end);
+	uint64_t newest = 0;
+	int64_t youngest = t0;
+	for (struct patch *patch = NULL; (patch = patch_store_after(store, 0, patch));) {
+		assert_true(patch->version <= ROWS);
+		assert_int_equal(patch->t_last_ns, t0 + ((int64_t)patch->version - 1) * 13333333ll);
+		assert_true(patch->t_first_ns >= t0 && patch->t_first_ns <= patch->t_last_ns);
+		newest = patch->version;
+		youngest = patch->t_first_ns > youngest ? patch->t_first_ns : youngest;
+	}
+	assert_int_equal(newest, ROWS);
+	assert_true(youngest > t0);
+	map_destroy(map);
+	mesher_destroy(mesher);
+	patch_store_destroy(store);
+}
+
+static void a_patch_that_loses_its_surface_becomes_a_tombstone(void **state)
+{
+	(void)state;
+	struct map *map = make_map(true);
+	struct mesher *mesher = mesher_create();
+	struct patch_store *store = patch_store_create();
+	struct patch_key key = {0, 0, 0};
+	struct block *block = grid_touch(map_grid(map), (struct block_key){0, 0, 0});
+	for (int v = 0; v < BLOCK_VOXELS; v++)
+		block->voxel[v].published = (int16_t)(((v >> 6) - 3) * 256 - 100);
+	grid_mark_changed(map_grid(map), block->key, (const uint8_t[3]){0xff, 0xff, 0xff});
+	mesh_dirty(map, mesher, store);
+	assert_int_equal(patch_store_count(store), 1);
+	for (int v = 0; v < BLOCK_VOXELS; v++)
+		block->voxel[v].published = VOXEL_UNKNOWN;
+	grid_mark_changed(map_grid(map), block->key, (const uint8_t[3]){0xff, 0xff, 0xff});
+	mesh_dirty(map, mesher, store);
+	assert_int_equal(patch_store_count(store), 0);
+	assert_int_equal(patch_store_get(store, key)->nt, 0);
+	map_destroy(map);
+	mesher_destroy(mesher);
+	patch_store_destroy(store);
+}
+
+/* Welds all living patches and judges them. */
+static struct soup_faults judge(const struct patch_store *store, uint32_t *ret_faces)
+{
+	struct patch **patches;
+	struct soup soup = {0};
+	size_t n = patch_store_living(store, &patches);
+	for (size_t i = 0; i < n; i++)
+		soup_add(&soup, patches[i]->key, patches[i]->nv, (const uint16_t(*)[3])patches[i]->vertex,
+		         patches[i]->nt, (const uint32_t(*)[3])patches[i]->triangle);
+	struct soup_faults faults = soup_judge(&soup);
+	*ret_faces = soup.nt;
+	soup_finish(&soup);
+	free(patches);
+	return faults;
+}
+
+static void the_patches_of_a_room_fit(void **state)
+{
+	(void)state;
+	for (int reduce = 0; reduce < 2; reduce++) {
+		struct mesher *mesher = mesher_create();
+		struct patch_store *store = patch_store_create();
+		struct map *map = make_room(reduce, 7, mesher, store);
+		uint32_t faces;
+		struct soup_faults faults = judge(store, &faces);
+		assert_int_equal(faults.repeated_edges, 0);
+		assert_int_equal(faults.flat, 0);
+		assert_true(faults.open_edges < 3 * faces / 10); /* the sweep ends somewhere */
+		map_destroy(map);
+		mesher_destroy(mesher);
+		patch_store_destroy(store);
+	}
+}
+
+/* Single voxels flipped in a half-unknown field, on every layer modulo 16, known and unknown too. */
+#define REGION      3
+#define REGION_KEYS (REGION * REGION * REGION)
+
+static struct patch_key region_key(int n)
+{
+	return (struct patch_key){n % REGION - 1, n / REGION % REGION - 1, n / REGION / REGION - 1};
+}
+
+static int random_below(uint64_t *state, int n)
+{
+	*state ^= *state << 13;
+	*state ^= *state >> 7;
+	*state ^= *state << 17;
+	return (int)((*state >> 11) % (uint64_t)n);
+}
+
+static void set_voxel(struct grid *grid, const int at[3], int16_t value)
+{
+	struct block_key key = {at[0] >> BLOCK_SHIFT, at[1] >> BLOCK_SHIFT, at[2] >> BLOCK_SHIFT};
+	struct block *block = grid_touch(grid, key);
+	block->voxel[((at[2] & 7) * BLOCK_SIDE + (at[1] & 7)) * BLOCK_SIDE + (at[0] & 7)].published = value;
+	grid_mark_changed(
+	    grid, key,
+	    (const uint8_t[3]){(uint8_t)(1 << (at[0] & 7)), (uint8_t)(1 << (at[1] & 7)), (uint8_t)(1 << (at[2] & 7))});
+}
+
+/* A surface that wanders through the region, in a band, with noise and holes. */
+static int16_t wandering(uint64_t *random, const int at[3])
+{
+	double x = at[0], y = at[1], z = at[2];
+	double d = z - 8 - 7 * sin(x * 0.11) * cos(y * 0.09) + (random_below(random, 1000) - 500) * 0.0008;
+	double e = x + 0.3 * y - 11 + (random_below(random, 1000) - 500) * 0.0008;
+	d = fabs(e) < fabs(d) ? e : d;
+	return fabs(d) > 3 || random_below(random, 100) < 6 ? VOXEL_UNKNOWN : (int16_t)lrint(d * 256);
+}
+
+static bool reads(int patch, int i, int halo)
+{
+	return i >= patch * PATCH_SIDE - halo && i <= patch * PATCH_SIDE + PATCH_SIDE + halo;
+}
+
+static struct map *wandering_map(bool reduce, uint64_t *random)
+{
+	struct map *map = make_map(reduce);
+	const struct patch_key *keys;
+	for (int n = 0; n < 64 * 64 * 64; n++) {
+		int at[3] = {n % 64 - 24, n / 64 % 64 - 24, n / 4096 - 24};
+		int16_t value = wandering(random, at);
+		if (value != VOXEL_UNKNOWN)
+			set_voxel(map_grid(map), at, value);
+	}
+	map_take_dirty(map, &keys);
+	return map;
+}
+
+static void change_voxel(struct map *map, uint64_t *random, int change, int ret_at[3])
+{
+	bool odd = (change + change / 48) & 1;
+	for (int a = 0; a < 3; a++)
+		ret_at[a] = random_below(random, 21) - 2;
+	ret_at[change % 3] = change / 3 % 16;
+	bool known = grid_published(map_grid(map), ret_at[0], ret_at[1], ret_at[2]) != VOXEL_UNKNOWN;
+	set_voxel(map_grid(map), ret_at, known && odd ? VOXEL_UNKNOWN : (int16_t)(random_below(random, 1001) - 500));
+}
+
+/* How many patches that were not marked (halo < 0: by the grid) are not what meshing everything gives. */
+static int stale_patches(bool reduce, int halo, int changes)
+{
+	uint64_t random = 4711;
+	struct map *map = wandering_map(reduce, &random);
+	struct mesher *mesher = mesher_create();
+	struct patch *held[REGION_KEYS];
+	int stale = 0;
+	for (int n = 0; n < REGION_KEYS; n++)
+		held[n] = map_mesh_patch(map, mesher, region_key(n), NULL);
+	for (int change = 0; change < changes; change++) {
+		const struct patch_key *keys;
+		int at[3];
+		change_voxel(map, &random, change, at);
+		size_t dirty = map_take_dirty(map, &keys);
+		for (int n = 0; n < REGION_KEYS; n++) {
+			struct patch_key key = region_key(n);
+			bool marked =
+			    reads(key.x, at[0], halo) && reads(key.y, at[1], halo) && reads(key.z, at[2], halo);
+			for (size_t d = 0; d < dirty && halo < 0; d++)
+				marked |= !patch_key_compare(key, keys[d]);
+			struct patch *patch = map_mesh_patch(map, mesher, key, NULL);
+			stale += !marked && !patch_equal(held[n], patch);
+			patch_unref(held[n]);
+			held[n] = patch;
+		}
+	}
+	for (int n = 0; n < REGION_KEYS; n++)
+		patch_unref(held[n]);
+	mesher_destroy(mesher);
+	map_destroy(map);
+	return stale;
+}
+
+static void raw_and_reduced_patches_that_are_not_dirty_have_not_changed(void **state)
+{
+	(void)state;
+	assert_int_equal(stale_patches(false, -1, 96), 0);
+	assert_int_equal(stale_patches(true, -1, 480), 0);
+}
+
+int main(void)
+{
+	const struct CMUnitTest tests[] = {
+	    cmocka_unit_test(the_same_rows_give_the_same_patches_however_often_they_are_meshed),
+	    cmocka_unit_test(times_and_versions_are_those_of_the_rows),
+	    cmocka_unit_test(a_patch_that_loses_its_surface_becomes_a_tombstone),
+	    cmocka_unit_test(the_patches_of_a_room_fit),
+	    cmocka_unit_test(raw_and_reduced_patches_that_are_not_dirty_have_not_changed),
+	};
+	return cmocka_run_group_tests(tests, NULL, NULL);
+}

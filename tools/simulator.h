@@ -1,5 +1,5 @@
 /* Simulated devices: implementations of the wire, never flags in the program (style, rule 6). They stand on one libuv
- * loop (the Modbus server in a thread of its own) and share one physical model, the scene. */
+ * loop (the Modbus server in a thread of its own) and share one physical model, the scene. Every t_ns is uv_hrtime(). */
 #ifndef FACET_TOOLS_SIMULATOR_H
 #define FACET_TOOLS_SIMULATOR_H
 
@@ -11,9 +11,11 @@
  * reader: its scanner measures only when `ready`. */
 struct scene {
 	void *ctx;
-	/* Fills range_m and state of `profile`, whose times, bearings and n are set: each beam cast at its own time. */
+	/* Fills range_m and state of `profile`, whose times, bearings and n are set: each beam cast at its own time. Called when the
+	 * last beam has passed. A profile that the host breaks off is begun anew and asked for again. */
 	void (*scan)(void *ctx, struct profile *profile);
-	/* May a profile begin at t_ns? NULL: always. Asked at every start of a mirror turn while streaming. */
+	/* May a profile begin from t_ns (now) on? NULL: always. Asked every millisecond while streaming and not measuring, until it
+	 * says yes; the profile then begins with the next turn of the mirror. */
 	bool (*ready)(void *ctx, int64_t t_ns);
 	/* The profile begun last was taken by its reader (nothing of it is left in the line). May be NULL. */
 	void (*taken)(void *ctx, int64_t t_ns);
@@ -30,7 +32,7 @@ struct sim_lms2xx_params {
 struct sim_lms2xx;
 /* NULL with one sentence in `error`. */
 struct sim_lms2xx *sim_lms2xx_create(uv_loop_t *, const struct sim_lms2xx_params *, const struct scene *, char error[160]);
-void sim_lms2xx_destroy(struct sim_lms2xx *); /* closes the pty, removes the link */
+void sim_lms2xx_destroy(struct sim_lms2xx *); /* closes the pty, removes the link; the loop must run once more */
 void sim_lms2xx_power_cycle(struct sim_lms2xx *); /* says 90, falls back to its power-on rate and state */
 
 /* A servo behind Modbus (libmodbus server): really moves with a speed. Position in 0.001 degree, i32 in two registers. */

@@ -66,6 +66,14 @@ static double number(const char *option, const char *word, double min, double ma
 	return value;
 }
 
+static int whole(const char *option, const char *word, int min, int max)
+{
+	double value = number(option, word, min, max);
+	if (value != (int)value)
+		refuse("--%s %s: give a whole number from %d to %d", option, word, min, max);
+	return (int)value;
+}
+
 static bool on_off(const char *option, const char *word)
 {
 	if (strcmp(word, "on") != 0 && strcmp(word, "off") != 0)
@@ -122,7 +130,7 @@ static error_t parse(int key, char *word, struct argp_state *state)
 		pose(options, POSE_LIST, word);
 		return 0;
 	case KEY_THREADS:
-		options->threads = (int)number("threads", word, 1, THREADS_MAX);
+		options->threads = whole("threads", word, 1, THREADS_MAX);
 		return 0;
 	case KEY_STATS:
 		options->stats = word;

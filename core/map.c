@@ -34,6 +34,7 @@ struct map {
 struct mesher {
 	struct arena arena;
 	struct window window;
+	struct surface raw; /* of the window; in the arena */
 	struct reduce_stats stats;
 	uint64_t faces_raw;
 };
@@ -192,41 +193,41 @@ uint64_t mesher_faces_raw(const struct mesher *mesher)
 	return mesher->faces_raw;
 }
 
-/* The surface of the mesher's window, reduced if the map wants it. 0 or -ENOMEM. */
-static int mesh_window(const struct map *map, struct mesher *mesher, struct surface *ret, uint32_t *ret_raw_faces)
+int map_extract(const struct map *map, struct mesher *mesher, struct patch_key key)
 {
-	struct surface raw;
-	int r = cubes_extract(&mesher->window, &mesher->arena, &raw);
-	if (r)
-		return r;
-	*ret_raw_faces = raw.nt;
-	if (map->params.reduce) {
-		const struct reduce_params params = {.tolerance = map->params.tolerance};
-		return reduce_surface(&mesher->window, &raw, &params, &mesher->arena, &mesher->stats, ret);
-	}
-	*ret = raw;
-	return 0;
+	assert(map && mesher);
+	arena_reset(&mesher->arena);
+	cubes_gather(map->grid, key, &mesher->window);
+	int r = cubes_extract(&mesher->window, &mesher->arena, &mesher->raw);
+	if (r == 0)
+		mesher->faces_raw += mesher->raw.nt;
+	return r;
+}
+
+struct patch *map_reduce(const struct map *map, struct mesher *mesher)
+{
+	assert(map && mesher);
+	struct surface surface = mesher->raw;
+	const struct reduce_params params = {.tolerance = map->params.tolerance};
+	if (map->params.reduce &&
+	    reduce_surface(&mesher->window, &mesher->raw, &params, &mesher->arena, &mesher->stats, &surface))
+		return NULL;
+	struct patch *patch = patch_create(mesher->window.key, &surface);
+	if (!patch)
+		return NULL;
+	const struct birth *birth = find_birth(map->birth, map->births_cap, patch->key);
+	patch->version = map_step(map);
+	patch->t_first_ns = birth->used ? birth->t_ns : map->t_ns;
+	patch->t_last_ns = map->t_ns;
+	return patch;
 }
 
 struct patch *map_mesh_patch(const struct map *map, struct mesher *mesher, struct patch_key key,
                              uint32_t *ret_raw_faces)
 {
-	assert(map && mesher);
-	struct surface surface;
-	uint32_t raw_faces = 0;
-	arena_reset(&mesher->arena);
-	cubes_gather(map->grid, key, &mesher->window);
-	if (mesh_window(map, mesher, &surface, &raw_faces))
+	if (map_extract(map, mesher, key))
 		return NULL;
-	struct patch *patch = patch_create(key, &surface);
-	if (!patch)
-		return NULL;
-	const struct birth *birth = find_birth(map->birth, map->births_cap, key);
-	patch->version = map_step(map);
-	patch->t_first_ns = birth->used ? birth->t_ns : map->t_ns;
-	patch->t_last_ns = map->t_ns;
-	mesher->faces_raw += raw_faces;
 	if (ret_raw_faces)
-		*ret_raw_faces = raw_faces;
-	return patch;
+		*ret_raw_faces = mesher->raw.nt;
+	return map_reduce(map, mesher);
 }

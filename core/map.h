@@ -43,4 +43,9 @@ uint64_t mesher_faces_raw(const struct mesher *); /* faces extracted, summed ove
  * `ret_raw_faces` (may be NULL): faces before the reduction. */
 struct patch *map_mesh_patch(const struct map *, struct mesher *, struct patch_key, uint32_t *ret_raw_faces);
 
+/* The two steps of map_mesh_patch, for whoever measures them: the raw surface into the mesher (0 or -ENOMEM), then the
+ * patch of the mesher's surface. */
+int map_extract(const struct map *, struct mesher *, struct patch_key);
+struct patch *map_reduce(const struct map *, struct mesher *);
+
 #endif

@@ -472,15 +472,23 @@ struct worker {
 	pthread_t thread;
 	struct mesher *mesher;
 	bool failed;
+	double extract, reduce; /* CPU seconds */
 };
 
 static void *mesh_patches(void *arg)
 {
 	struct worker *worker = arg;
 	struct work *work = worker->work;
+	double begin = cpu_seconds(CLOCK_THREAD_CPUTIME_ID);
 	for (size_t i; (i = atomic_fetch_add(&work->next, 1)) < work->n;) {
-		work->patch[i] = map_mesh_patch(work->map, worker->mesher, work->key[i], NULL);
+		int r = map_extract(work->map, worker->mesher, work->key[i]);
+		double extracted = cpu_seconds(CLOCK_THREAD_CPUTIME_ID);
+		work->patch[i] = r == 0 ? map_reduce(work->map, worker->mesher) : NULL;
 		worker->failed |= !work->patch[i];
+		double reduced = cpu_seconds(CLOCK_THREAD_CPUTIME_ID);
+		worker->extract += extracted - begin;
+		worker->reduce += reduced - extracted;
+		begin = reduced;
 	}
 	return NULL;
 }
@@ -505,6 +513,8 @@ static bool run_workers(struct run *run, struct work *work, struct worker *worke
 		good &= !worker[i].failed;
 		if (worker[i].mesher)
 			run->figures.faces_raw += mesher_faces_raw(worker[i].mesher);
+		run->figures.seconds[EXTRACT] += worker[i].extract;
+		run->figures.seconds[REDUCE] += worker[i].reduce;
 		mesher_destroy(worker[i].mesher);
 	}
 	return good;
@@ -546,13 +556,13 @@ static int make_mesh(struct run *run)
 	struct worker *worker = calloc((size_t)run->options.threads, sizeof *worker);
 	show_progress("meshing");
 	bool good = work.patch && worker && run_workers(run, &work, worker, run->options.threads);
-	lap(run, EXTRACT);
+	run->lap = cpu_seconds(CLOCK_PROCESS_CPUTIME_ID); /* the threads have measured themselves */
 	if (work.patch)
 		good &= keep_patches(run, work.patch, work.n);
 	free(work.patch);
 	free(worker);
 	end_progress();
-	lap(run, REDUCE);
+	lap(run, WRITE);
 	return good ? 0 : out_of_memory(run->options.output);
 }
 

@@ -32,7 +32,7 @@ void field_fold_points(struct field *);
 
 struct field_stats {
 	uint64_t rows, points, samples, singles, rays, far_points; /* folded so far */
-	uint64_t step; /* applied (folded) rows */
+	uint64_t step;                                             /* applied (folded) rows */
 };
 void field_stats(const struct field *, struct field_stats *ret);
 

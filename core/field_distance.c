@@ -125,9 +125,13 @@ static double distance2(struct vec3 a, struct vec3 b)
 /* Samples along a side whose longer edge has this squared length. */
 static int samples_along(double a2, double b2)
 {
-	double n = ceil(sqrt(a2 > b2 ? a2 : b2) / SAMPLE_STEP);
+	double m2 = a2 > b2 ? a2 : b2;
+	double n;
 
-	return n < 1 ? 1 : n > SAMPLES_MAX ? SAMPLES_MAX : (int)n;
+	if (m2 <= SAMPLE_STEP * SAMPLE_STEP)
+		return 1;
+	n = sqrt(m2) / SAMPLE_STEP;
+	return n > SAMPLES_MAX - 1 ? SAMPLES_MAX : (int)n + 1;
 }
 
 static void quad_add(struct field *field, const struct raster_line *above, const struct raster_line *line, int32_t c)

@@ -91,27 +91,33 @@ struct fold_plane fold_plane(struct vec3 normal, double weight)
 	plane.inverse = 1 / plane.n[plane.axis];
 	plane.half = BAND_CELLS * fabs(plane.inverse);
 	plane.step = floor_int(plane.n[plane.axis] * 65536 + 0.5);
-	plane.weight = (uint32_t)(weight * (WEIGHT_SCALE * 65536.0 / BAND_UNITS) + 0.5);
+	plane.weight = (int32_t)(weight * (WEIGHT_SCALE * 65536.0 / BAND_UNITS) + 0.5);
 	return plane;
 }
 
-/* Adds to the voxels first..last of a column within one block; `d` is the distance of the first in 1/65536 cell. */
-static void column_add(struct scratch_block *b, int first, int last, int stride, int32_t d,
-                       const struct fold_plane *plane)
+/* Adds to `n` voxels of a column within one block; `d` is the distance of the first in 1/65536 cell. */
+static void column_add(accumulator *at, int n, int stride, int32_t d, const struct fold_plane *plane)
 {
-	for (int i = first;; i += stride, d += plane->step) {
-		struct accumulator *a = &b->at[i];
+	for (; n > 0; n--, at += stride, d += plane->step) {
 		int32_t distance = (d + 128) >> 8;
 		int32_t left = BAND_UNITS - (distance < 0 ? -distance : distance);
-		int32_t weight = left > 0 ? (int32_t)(((uint32_t)left * plane->weight + 32768) >> 16) : 1;
+		int32_t weight = (left * plane->weight + 32768) >> 16;
 
-		weight += !weight;
-		a->sum += (int64_t)weight * distance;
-		a->weight += (uint32_t)weight;
-		b->seen[i >> 6] |= UINT64_C(1) << (i & 63);
-		if (i == last)
-			break;
+		weight = weight > 1 ? weight : 1;
+		*at += ((int64_t)(weight * distance) * (1 << WEIGHT_BITS)) + weight;
 	}
+}
+
+/* The bits of voxels first, first + stride, ... last in a word of `seen`; strides 1 and 8 only. */
+static void column_mark(struct scratch_block *b, int first, int last, int axis)
+{
+	const uint64_t all = axis == 0 ? ~UINT64_C(0) : UINT64_C(0x0101010101010101) << (first & 7);
+
+	if (axis == 2)
+		b->columns |= UINT64_C(1) << (first & 63);
+	else
+		b->seen[first >> 6] |=
+		    all << (axis == 0 ? first & 63 : 8 * (first >> 3 & 7)) & ~UINT64_C(0) >> (63 - (last & 63));
 }
 
 /* A full scratch is folded; what follows goes into the empty one. */
@@ -140,6 +146,9 @@ void fold_sample(struct fold *fold, const struct fold_plane *plane, struct vec3 
 	int32_t k = -floor_int(plane->half - crossing), last = floor_int(crossing + plane->half);
 	int32_t d = floor_int((k - crossing) * plane->n[a] * 65536 + 0.5);
 
+	if (fold->samples == FOLD_SAMPLES_MAX)
+		fold_apply(fold);
+	fold->samples++;
 	fold->stats.samples++;
 	key[b] = at[b] >> BLOCK_SHIFT;
 	key[c] = at[c] >> BLOCK_SHIFT;
@@ -155,9 +164,12 @@ void fold_sample(struct fold *fold, const struct fold_plane *plane, struct vec3 
 		end = end < last ? end : last;
 		key[a] = k >> BLOCK_SHIFT;
 		block = scratch_make_room(fold, key[0], key[1], key[2]);
-		if (block)
-			column_add(block, base + (k & (BLOCK_SIDE - 1)) * stride,
-			           base + (end & (BLOCK_SIDE - 1)) * stride, stride, d, plane);
+		if (block) {
+			int first = base + (k & (BLOCK_SIDE - 1)) * stride;
+
+			column_add(&block->at[first], end - k + 1, stride, d, plane);
+			column_mark(block, first, base + (end & (BLOCK_SIDE - 1)) * stride, a);
+		}
 		d += (end + 1 - k) * plane->step;
 		k = end + 1;
 	}
@@ -168,19 +180,21 @@ static int64_t divide_rounded(int64_t a, int64_t b) /* b > 0; halves away from z
 	return a >= 0 ? (a + b / 2) / b : -((-a + b / 2) / b);
 }
 
-static void voxel_fold(struct voxel *v, const struct accumulator *a)
+static void voxel_fold(struct voxel *v, accumulator a, uint32_t rays)
 {
 	int64_t sum = v->sum, weight = v->weight;
 
-	if (a->weight) {
-		sum += a->sum;
-		weight += a->weight;
+	if (a) {
+		int64_t added = a & ((1 << WEIGHT_BITS) - 1);
+
+		sum += (a - added) / (1 << WEIGHT_BITS); /* exact */
+		weight += added;
 		if (weight > WEIGHT_MAX) {
 			sum = divide_rounded(sum * WEIGHT_MAX, weight);
 			weight = WEIGHT_MAX;
 		}
 	} else if (sum < 0) {
-		int64_t taken = (int64_t)a->rays * FREE_WEIGHT;
+		int64_t taken = (int64_t)rays * FREE_WEIGHT;
 		int64_t rest = weight > taken ? weight - taken : 0;
 
 		if (rest < WEIGHT_KNOWN)
@@ -213,53 +227,68 @@ static bool voxel_publish(struct voxel *v)
 /* Folds one word (a layer of constant z) and empties its accumulators; the bits that changed. */
 static uint64_t layer_fold(struct fold *fold, struct block *block, struct scratch_block *from, int z)
 {
-	uint64_t bits = from->seen[z] | from->passed[z], changed = 0;
+	uint64_t bits = from->seen[z] | from->columns | from->passed[z], changed = 0, negative = block->negative[z];
 
-	from->seen[z] = from->passed[z] = 0;
 	for (; bits; bits &= bits - 1) {
-		int bit = __builtin_ctzll(bits), i = z * 64 + bit;
+		int i = z * 64 + __builtin_ctzll(bits);
+		const uint64_t bit = bits & -bits;
 		struct voxel *v = &block->voxel[i];
-		bool negative = v->sum < 0;
 
-		voxel_fold(v, &from->at[i]);
-		from->at[i] = (struct accumulator){0};
-		block->negatives = (uint16_t)(block->negatives + (v->sum < 0) - negative);
+		if (!from->at[i] && !(from->passed[z] & bit))
+			continue;
+		voxel_fold(v, from->at[i], from->rays[i]);
+		from->at[i] = 0;
+		from->rays[i] = 0;
+		negative = v->sum < 0 ? negative | bit : negative & ~bit;
 		if (voxel_publish(v)) {
-			changed |= UINT64_C(1) << bit;
+			changed |= bit;
 			fold->stats.cleared += v->published == VOXEL_UNKNOWN;
 		}
 	}
+	from->seen[z] = from->passed[z] = 0;
+	block->negative[z] = negative;
 	return changed;
+}
+
+/* Projects the bits of a block onto its layers along x, y and z. */
+static void layers_of(const uint64_t bits[BLOCK_SIDE], uint8_t ret_layers[3])
+{
+	uint64_t all = 0;
+
+	memset(ret_layers, 0, 3);
+	for (int z = 0; z < BLOCK_SIDE; z++) {
+		all |= bits[z];
+		ret_layers[2] |= (uint8_t)((bits[z] != 0) << z);
+	}
+	for (int y = 0; y < BLOCK_SIDE; y++) {
+		uint8_t row = (uint8_t)(all >> 8 * y);
+
+		ret_layers[0] |= row;
+		ret_layers[1] |= (uint8_t)((row != 0) << y);
+	}
 }
 
 static void block_fold(struct fold *fold, struct block *block, struct scratch_block *from)
 {
-	uint8_t layers[3] = {0};
+	uint64_t changed[BLOCK_SIDE];
+	uint8_t layers[3];
 
-	for (int z = 0; z < BLOCK_SIDE; z++) {
-		uint64_t changed = layer_fold(fold, block, from, z);
-
-		if (!changed)
-			continue;
-		layers[2] |= (uint8_t)(1 << z);
-		for (int y = 0; y < BLOCK_SIDE; y++) {
-			uint8_t row = (uint8_t)(changed >> 8 * y);
-
-			layers[0] |= row;
-			layers[1] |= (uint8_t)((row != 0) << y);
-		}
-	}
+	for (int z = 0; z < BLOCK_SIDE; z++)
+		changed[z] = layer_fold(fold, block, from, z);
+	from->columns = 0;
+	layers_of(block->negative, block->layers);
+	layers_of(changed, layers);
 	grid_mark_changed(fold->grid, block->key, layers);
 }
 
 /* The grid refused the block: what was for it is lost. */
 static void block_drop(struct scratch_block *from)
 {
-	for (int z = 0; z < BLOCK_SIDE; z++) {
-		for (uint64_t bits = from->seen[z] | from->passed[z]; bits; bits &= bits - 1)
-			from->at[z * 64 + __builtin_ctzll(bits)] = (struct accumulator){0};
-		from->seen[z] = from->passed[z] = 0;
-	}
+	memset(from->seen, 0, sizeof(from->seen));
+	memset(from->passed, 0, sizeof(from->passed));
+	memset(from->at, 0, sizeof(from->at));
+	memset(from->rays, 0, sizeof(from->rays));
+	from->columns = 0;
 }
 
 static int compare_blocks(const void *a, const void *b)
@@ -284,6 +313,7 @@ void fold_apply(struct fold *fold)
 			block_drop(fold->block[i]);
 	}
 	fold->used = 0;
+	fold->samples = 0;
 	memset(fold->recent, 0, sizeof(fold->recent));
 }
 

@@ -23,12 +23,12 @@ void fold_destroy(struct fold *);
 
 /* A piece of plane, prepared once for all its samples. */
 struct fold_plane {
-	double n[3];     /* towards the scanner, unit length */
-	double inverse;  /* 1 / n[axis] */
-	double half;     /* voxels along the axis on either side */
-	int32_t step;    /* distance from voxel to voxel along the axis, 1/65536 cell */
-	uint32_t weight; /* 4 w / (256 BAND_CELLS), in 1/65536 */
-	int axis;        /* the dominant one, 0..2 */
+	double n[3];    /* towards the scanner, unit length */
+	double inverse; /* 1 / n[axis] */
+	double half;    /* voxels along the axis on either side */
+	int32_t step;   /* distance from voxel to voxel along the axis, 1/65536 cell */
+	int32_t weight; /* 4 w / (256 BAND_CELLS), in 1/65536 */
+	int axis;       /* the dominant one, 0..2 */
 };
 
 /* `weight` of a sample right on a voxel is 4 * weight, at most 32 * 4. */

@@ -38,7 +38,8 @@ struct patch_key {
 
 struct block {
 	struct block_key key;
-	uint16_t negatives;               /* voxels with a negative sum, kept by the field: what a ray may clear */
+	uint8_t layers[3]; /* kept by the field, as is `negative`: bit b where layer b along x, y, z has such a voxel */
+	uint64_t negative[BLOCK_SIDE]; /* bit y * 8 + x of word z: the sum is negative, so a ray may clear the voxel */
 	struct voxel voxel[BLOCK_VOXELS]; /* index (z * 8 + y) * 8 + x */
 };
 

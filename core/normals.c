@@ -14,6 +14,7 @@
 #define HALF_MAX      10    /* beams or lines */
 #define RESIDUAL_M    0.010 /* rms beyond which other windows are tried */
 #define UNITS_M       8000.0
+#define LINE_RATIO    1e-6 /* least second eigenvalue of the greatest: below it the points lie on a line */
 #define TILT_VARIANCE 0.02 /* rad2: a normal less certain than this is none */
 
 struct fit {
@@ -55,23 +56,18 @@ static double window_sums(struct raster *raster, const struct frame *w, const ui
 	return n;
 }
 
-/* Least eigenvalue of a symmetric matrix (xx xy xz yy yz zz) with trace 1; -1 where the points lie on a line. */
-static double least_eigenvalue(const double a[6])
+/* Least root of x^3 - c2 x^2 + c1 x - c0, the characteristic polynomial of a matrix without negative eigenvalues.
+ * Newton's steps from 0; the third no longer moves a normal. */
+static double least_root(double c2, double c1, double c0)
 {
-	double c1 = a[0] * a[3] - a[1] * a[1] + a[0] * a[5] - a[2] * a[2] + a[3] * a[5] - a[4] * a[4];
-	double c0 = a[0] * (a[3] * a[5] - a[4] * a[4]) - a[1] * (a[1] * a[5] - a[4] * a[2]) +
-	            a[2] * (a[1] * a[4] - a[3] * a[2]);
-	double x;
+	double x = c0 / c1;
 
-	if (!(c1 > 1e-6))
-		return -1;
-	x = c0 / c1;
-	for (int i = 0; i < 3; i++) {
-		double slope = (3 * x - 2) * x + c1;
+	for (int i = 0; i < 2; i++) {
+		double slope = (3 * x - 2 * c2) * x + c1;
 
-		if (!(slope > 1e-9))
+		if (!(slope > 1e-9 * c1))
 			break;
-		x -= (((x - 1) * x + c1) * x - c0) / slope;
+		x -= (((x - c2) * x + c1) * x - c0) / slope;
 	}
 	return x > 0 ? x : 0;
 }
@@ -81,31 +77,31 @@ static struct vec3 longest(struct vec3 a, struct vec3 b)
 	return vec3_dot(a, a) >= vec3_dot(b, b) ? a : b;
 }
 
+/* No plane: fewer than four points, points on a line, or a slope that the scatter leaves open. */
 static struct fit fit_sums(double n, const double s[3], const double q[6])
 {
-	double a[6] = {q[0] - s[0] * s[0] / n, q[1] - s[0] * s[1] / n, q[2] - s[0] * s[2] / n,
-	               q[3] - s[1] * s[1] / n, q[4] - s[1] * s[2] / n, q[5] - s[2] * s[2] / n};
-	double trace = a[0] + a[3] + a[5], least, second;
-	struct fit none = {.variance = -1};
+	const double per_n = 1 / n, mx = s[0] * per_n, my = s[1] * per_n, mz = s[2] * per_n;
+	double xx = q[0] - s[0] * mx, xy = q[1] - s[0] * my, xz = q[2] - s[0] * mz;
+	double yy = q[3] - s[1] * my, yz = q[4] - s[1] * mz, zz = q[5] - s[2] * mz;
+	double c2 = xx + yy + zz;
+	double c1 = xx * yy - xy * xy + xx * zz - xz * xz + yy * zz - yz * yz;
+	double c0 = xx * (yy * zz - yz * yz) - xy * (xy * zz - yz * xz) + xz * (xy * yz - yy * xz);
+	const struct fit none = {.variance = -1};
+	double least;
 
-	if (!(trace > 0))
+	if (!(c1 > LINE_RATIO * c2 * c2))
 		return none;
-	for (int i = 0; i < 6; i++)
-		a[i] /= trace;
-	least = least_eigenvalue(a);
-	if (least < 0)
+	least = least_root(c2, c1, c0);
+	/* the slope's variance is that of the scatter over n times the second eigenvalue, which c1 / c2 bounds from below */
+	if (least * c2 > TILT_VARIANCE * (n - 3) * c1)
 		return none;
-	/* the two larger eigenvalues sum to 1 - least; c1 bounds the smaller of them from below */
-	second = a[0] * a[3] - a[1] * a[1] + a[0] * a[5] - a[2] * a[2] + a[3] * a[5] - a[4] * a[4];
-	if (least > TILT_VARIANCE * (n - 3) * second)
-		return none;
-	struct vec3 x = {a[0] - least, a[1], a[2]}, y = {a[1], a[3] - least, a[4]}, z = {a[2], a[4], a[5] - least};
+	struct vec3 x = {xx - least, xy, xz}, y = {xy, yy - least, yz}, z = {xz, yz, zz - least};
 	struct vec3 v = longest(longest(vec3_cross(x, y), vec3_cross(y, z)), vec3_cross(z, x));
 	double length = vec3_norm(v);
 
 	if (!(length > 0))
 		return none;
-	return (struct fit){.normal = vec3_scale(v, 1 / length), .variance = least * trace / (n - 3)};
+	return (struct fit){.normal = vec3_scale(v, 1 / length), .variance = least / (n - 3)};
 }
 
 static struct fit fit_window(struct raster *raster, const struct frame *w, const uint32_t at[3])

@@ -12,7 +12,8 @@
 
 #include "core/types.h"
 
-#define RASTER_LINES 20 /* the window's reach above (15), the line below it, the line itself, look-ahead 2, one more \
+#define RASTER_LINES \
+	20 /* the window's reach above (15), the line below it, the line itself, look-ahead 2, one more \
 	                 */
 #define RASTER_LOOKAHEAD 2     /* lines at most */
 #define RASTER_BEAMS_MAX 16384 /* of a row; what is beyond is not looked at */

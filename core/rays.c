@@ -10,34 +10,29 @@
 #include <stdlib.h>
 #include <string.h>
 
-/* A walk through cells of a side of 1 along origin + t * direction. */
+/* A walk through cells of side `size` along origin + t * direction, t in [0, 1]. */
+struct line {
+	double origin[3], direction[3];
+	double inverse[3]; /* 1 / direction; where that is 0, a number that no t reaches */
+};
+
 struct walk {
 	int32_t cell[3];
 	int32_t step[3];
-	double next[3]; /* t where the ray leaves the cell through that axis */
+	double next[3]; /* t where the line leaves the cell through that axis */
 	double delta[3];
 };
 
-static struct walk walk_begin(const double origin[3], const double direction[3], double t, const int32_t low[3],
-                              const int32_t high[3])
+#define NEVER 1e30
+
+static void walk_axis_begin(struct walk *w, const struct line *l, int a, int32_t cell, double size)
 {
-	struct walk w;
+	bool up = l->direction[a] > 0;
 
-	for (int a = 0; a < 3; a++) {
-		int32_t c = floor_int(origin[a] + t * direction[a]);
-
-		/* the point may lie a rounding error outside of the box it enters */
-		c = c < low[a] ? low[a] : c > high[a] ? high[a] : c;
-		w.cell[a] = c;
-		w.step[a] = direction[a] > 0 ? 1 : -1;
-		if (direction[a] == 0) {
-			w.next[a] = w.delta[a] = 1e30;
-			continue;
-		}
-		w.delta[a] = 1 / fabs(direction[a]);
-		w.next[a] = (c + (direction[a] > 0) - origin[a]) / direction[a];
-	}
-	return w;
+	w->cell[a] = cell;
+	w->step[a] = up ? 1 : -1;
+	w->delta[a] = size * fabs(l->inverse[a]);
+	w->next[a] = l->direction[a] == 0 ? NEVER : ((cell + up) * size - l->origin[a]) * l->inverse[a];
 }
 
 static int walk_axis(const struct walk *w)
@@ -47,70 +42,119 @@ static int walk_axis(const struct walk *w)
 	return w->next[2] < w->next[a] ? 2 : a;
 }
 
-static void walk_step(struct walk *w, int axis)
+static int32_t clamp(int32_t v, int32_t low, int32_t high)
 {
-	w->cell[axis] += w->step[axis];
-	w->next[axis] += w->delta[axis];
+	return v < low ? low : v > high ? high : v;
 }
 
-/* From t to the end of the ray or of the block. */
-static void block_pass(struct fold *fold, const struct block *block, const double origin[3], const double direction[3],
-                       double t, uint32_t count)
+/* Where the line enters (t0) and leaves (t1) a block, in its voxels; false where no negative voxel lies between. */
+static bool block_enter(const struct block *block, const struct line *l, double t0, double t1, int32_t ret_low[3],
+                        struct walk *ret)
 {
-	const int32_t low[3] = {block->key.x * BLOCK_SIDE, block->key.y * BLOCK_SIDE, block->key.z * BLOCK_SIDE};
-	const int32_t high[3] = {low[0] + BLOCK_SIDE - 1, low[1] + BLOCK_SIDE - 1, low[2] + BLOCK_SIDE - 1};
-	struct walk w = walk_begin(origin, direction, t, low, high);
+	const int32_t key[3] = {block->key.x, block->key.y, block->key.z};
+	int32_t from[3];
+
+	for (int a = 0; a < 3; a++) {
+		int32_t low = key[a] * BLOCK_SIDE, to;
+
+		/* a point may lie a rounding error outside of the block it enters */
+		from[a] = clamp(floor_int(l->origin[a] + t0 * l->direction[a]) - low, 0, BLOCK_SIDE - 1);
+		to = clamp(floor_int(l->origin[a] + t1 * l->direction[a]) - low, 0, BLOCK_SIDE - 1);
+		int32_t first = from[a] < to ? from[a] : to, last = from[a] < to ? to : from[a];
+
+		if (!(block->layers[a] >> first & ((2 << (last - first)) - 1)))
+			return false;
+		ret_low[a] = low;
+	}
+	for (int a = 0; a < 3; a++)
+		walk_axis_begin(ret, l, a, ret_low[a] + from[a], 1);
+	return true;
+}
+
+static void block_pass(struct fold *fold, const struct block *block, const struct line *l, double t0, double t1,
+                       uint32_t count)
+{
 	struct scratch_block *scratch = NULL;
+	int32_t low[3];
+	struct walk w;
+	int axis;
 
-	for (;;) {
-		int i = ((w.cell[2] - low[2]) * BLOCK_SIDE + (w.cell[1] - low[1])) * BLOCK_SIDE + (w.cell[0] - low[0]);
-		int axis;
+	if (!block_enter(block, l, t0, t1, low, &w))
+		return;
+	do {
+		int z = w.cell[2] - low[2], bit = (w.cell[1] - low[1]) * BLOCK_SIDE + (w.cell[0] - low[0]);
 
-		if (block->voxel[i].sum < 0) {
+		if (block->negative[z] >> bit & 1) {
 			if (!scratch)
 				scratch = scratch_touch(fold, block->key.x, block->key.y, block->key.z);
 			if (!scratch)
 				return;
-			scratch->at[i].rays += count;
-			scratch->passed[i >> 6] |= UINT64_C(1) << (i & 63);
+			scratch->rays[z * 64 + bit] += count;
+			scratch->passed[z] |= UINT64_C(1) << bit;
 		}
 		axis = walk_axis(&w);
 		if (w.next[axis] > 1)
 			return;
-		walk_step(&w, axis);
-		if (w.cell[axis] < low[axis] || w.cell[axis] > high[axis])
-			return;
-	}
+		w.next[axis] += w.delta[axis];
+		w.cell[axis] += w.step[axis];
+	} while ((uint32_t)(w.cell[axis] - low[axis]) < BLOCK_SIDE);
 }
 
-static void ray_walk(struct fold *fold, const struct ray *ray)
+/* The block at a key, or NULL, remembered: neighbouring rays ask for the same ones, and the grid does not change meanwhile. */
+struct memory {
+	struct block_key key;
+	bool known;
+	const struct block *block;
+};
+
+#define MEMORY_SIZE 512
+
+static const struct block *memory_find(struct memory *memory, const struct grid *grid, const int32_t cell[3])
 {
-	static const int32_t low[3] = {INT32_MIN, INT32_MIN, INT32_MIN}, high[3] = {INT32_MAX, INT32_MAX, INT32_MAX};
+	struct memory *m = &memory[(cell[0] & 7) | (cell[1] & 7) << 3 | (cell[2] & 7) << 6];
+
+	if (!m->known || m->key.x != cell[0] || m->key.y != cell[1] || m->key.z != cell[2]) {
+		m->key = (struct block_key){cell[0], cell[1], cell[2]};
+		m->block = grid_find(grid, m->key);
+		m->known = true;
+	}
+	return m->block;
+}
+
+static void ray_walk(struct fold *fold, struct memory *memory, const struct ray *ray)
+{
 	/* voxels are the cells about corners: half a cell on, floor finds the nearest corner */
-	const double origin[3] = {ray->origin.x + 0.5, ray->origin.y + 0.5, ray->origin.z + 0.5};
-	const double direction[3] = {ray->end.x - ray->origin.x, ray->end.y - ray->origin.y,
-	                             ray->end.z - ray->origin.z};
-	const double per_block = 1.0 / BLOCK_SIDE;
-	const double coarse_origin[3] = {origin[0] * per_block, origin[1] * per_block, origin[2] * per_block};
-	const double coarse[3] = {direction[0] * per_block, direction[1] * per_block, direction[2] * per_block};
-	struct walk w = walk_begin(coarse_origin, coarse, 0, low, high);
+	struct line l = {
+	    .origin = {ray->origin.x + 0.5, ray->origin.y + 0.5, ray->origin.z + 0.5},
+	    .direction = {ray->end.x - ray->origin.x, ray->end.y - ray->origin.y, ray->end.z - ray->origin.z}};
+	struct walk w;
 	double t = 0;
 
+	for (int a = 0; a < 3; a++) {
+		l.inverse[a] = l.direction[a] == 0 ? NEVER : 1 / l.direction[a];
+		walk_axis_begin(&w, &l, a, floor_int(l.origin[a]) >> BLOCK_SHIFT, BLOCK_SIDE);
+	}
 	while (t <= 1) {
-		const struct block *block = grid_find(fold->grid, (struct block_key){w.cell[0], w.cell[1], w.cell[2]});
+		const struct block *block = memory_find(memory, fold->grid, w.cell);
 		int axis = walk_axis(&w);
+		double out = w.next[axis];
 
-		if (block && block->negatives)
-			block_pass(fold, block, origin, direction, t, ray->count);
-		t = w.next[axis];
-		walk_step(&w, axis);
+		if (block && block->layers[0])
+			block_pass(fold, block, &l, t, out < 1 ? out : 1, ray->count);
+		t = out;
+		w.next[axis] += w.delta[axis];
+		w.cell[axis] += w.step[axis];
 	}
 }
 
 void rays_walk(struct fold *fold)
 {
+	struct memory memory[MEMORY_SIZE];
+
+	for (int i = 0; i < MEMORY_SIZE; i++)
+		memory[i].known = false;
 	for (uint32_t i = 0; i < fold->rays; i++)
-		ray_walk(fold, &fold->ray[i]);
+		ray_walk(fold, memory, &fold->ray[i]);
 	if (fold->rays)
 		memset(fold->ray_slot, 0, 2 * (size_t)fold->rays_cap * sizeof(*fold->ray_slot));
 	fold->stats.rays += fold->rays;

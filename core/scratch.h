@@ -4,18 +4,21 @@
 
 #include "core/fold.h"
 
-struct accumulator {
-	int64_t sum;     /* of weight * distance */
-	uint32_t weight; /* of surface in this row */
-	uint32_t rays;   /* that passed through */
-};
+/* Sums of one voxel in one word: weight * distance in the upper 40 bits, weight in the lower 24. A contribution weighs at
+ * most 129, so FOLD_SAMPLES_MAX of them fit; then the row is folded in parts. 0: nothing (a contribution weighs at least 1). */
+typedef int64_t accumulator;
+
+#define WEIGHT_BITS      24
+#define FOLD_SAMPLES_MAX 130000
 
 struct scratch_block {
 	struct block_key key;
 	uint32_t slot;
-	uint64_t seen[BLOCK_SIDE];   /* bit y * 8 + x of word z: got surface weight */
-	uint64_t passed[BLOCK_SIDE]; /* likewise: a ray took weight */
-	struct accumulator at[BLOCK_VOXELS];
+	uint64_t seen[BLOCK_SIDE];   /* bit y * 8 + x of word z: got surface weight, columns along z apart */
+	uint64_t columns;            /* bit y * 8 + x: somewhere in this column along z there is surface weight */
+	uint64_t passed[BLOCK_SIDE]; /* as `seen`: a ray took weight */
+	accumulator at[BLOCK_VOXELS];
+	uint32_t rays[BLOCK_VOXELS]; /* that passed through */
 };
 
 struct ray {
@@ -28,6 +31,7 @@ struct fold {
 	struct grid *grid;
 	struct scratch_block **block; /* in order of their making; allocated ones stay */
 	uint32_t used, made;
+	uint32_t samples;                /* since the last fold */
 	uint32_t *slot;                  /* block number + 1, 0: empty */
 	struct scratch_block *recent[8]; /* by the parity of the key: neighbours never evict each other */
 	struct ray *ray;

@@ -3,7 +3,7 @@
 #ifndef FACET_CORE_TRIG_H
 #define FACET_CORE_TRIG_H
 
-#define TRIG_PI 3.14159265358979323846
+#define TRIG_PI  3.14159265358979323846
 #define TRIG_DEG (TRIG_PI / 180.0)
 
 double trig_sin(double rad);

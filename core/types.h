@@ -14,7 +14,7 @@
 /* Why a beam is no surface. The first group is said by the device, the second by the assembler. */
 enum beam_state {
 	BEAM_OK = 0,
-	BEAM_NO_ECHO,       /* no valid value */
+	BEAM_NO_ECHO, /* no valid value */
 	BEAM_DAZZLED,
 	BEAM_OVERFLOW,      /* arithmetic overflow */
 	BEAM_WEAK,          /* signal to noise too small */
@@ -30,12 +30,13 @@ enum beam_state {
 
 /* One reading of a 2D scanner: n ranges on a fan. Decoder -> assembler. */
 struct profile {
-	int64_t t_ns;      /* time of the first beam */
-	int32_t beam_ns;   /* between neighbouring beams of one turn of the mirror */
-	int32_t turn_ns;   /* one turn of the mirror */
-	uint8_t interlace; /* turns that make the profile (1, 2 or 4): beam k belongs to turn k % interlace, place k / interlace */
-	uint8_t part;      /* a partial scan: its number 0..3 within the raster of `parts`; else 0 */
-	uint8_t parts;     /* 1, or how many partial scans make the full raster */
+	int64_t t_ns;    /* time of the first beam */
+	int32_t beam_ns; /* between neighbouring beams of one turn of the mirror */
+	int32_t turn_ns; /* one turn of the mirror */
+	uint8_t
+	    interlace; /* turns that make the profile (1, 2 or 4): beam k belongs to turn k % interlace, place k / interlace */
+	uint8_t part;  /* a partial scan: its number 0..3 within the raster of `parts`; else 0 */
+	uint8_t parts; /* 1, or how many partial scans make the full raster */
 	uint16_t n;
 	double first_rad, step_rad; /* bearing of beam 0 and from beam to beam; 0 is straight ahead, positive left */
 	float range_m[PROFILE_BEAMS_MAX];
@@ -65,8 +66,8 @@ struct row_beam {
 /* One turn of the mirror, every beam at its own time and place. Assembler -> field.
  * Allocated in one piece with its beams (row_create), owned by whoever holds it last. */
 struct row {
-	uint64_t number; /* assembled rows, from 0 per map, several devices sharing the numbering */
-	uint32_t raster; /* rows of one raster (one device) are neighbours of each other */
+	uint64_t number;   /* assembled rows, from 0 per map, several devices sharing the numbering */
+	uint32_t raster;   /* rows of one raster (one device) are neighbours of each other */
 	bool starts_sweep; /* the servo turned before this row, or the raster was cut: no neighbour below */
 	bool ends_sweep;   /* known only at the end of an input; a turn is seen by the next row's starts_sweep */
 	int64_t t_ns;      /* of the first beam */

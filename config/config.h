@@ -10,63 +10,68 @@
 #include "core/sweep.h"
 
 #define CONFIG_DEVICES_MAX 16
-#define CONFIG_NAME_MAX 32
-#define CONFIG_TEXT_MAX 256
-#define CONFIG_LISTEN_MAX 4
-#define CONFIG_WRITES_MAX 16
+#define CONFIG_NAME_MAX    32
+#define CONFIG_TEXT_MAX    256
+#define CONFIG_LISTEN_MAX  4
+#define CONFIG_WRITES_MAX  16
 
 struct config_register { /* a Modbus value */
 	bool set;
-	uint8_t function;    /* 3 holding, 4 input; targets are written with 6 or 16 */
+	uint8_t function; /* 3 holding, 4 input; targets are written with 6 or 16 */
 	uint16_t address;
 	enum { REGISTER_I16, REGISTER_U16, REGISTER_I32, REGISTER_U32, REGISTER_F32 } type;
 	enum { ORDER_ABCD, ORDER_CDAB, ORDER_BADC, ORDER_DCBA } order;
-	double scale;        /* radians (or rad/s) = sign * scale * (raw - zero); written `0.001deg` */
-	double zero;         /* raw counts */
-	int sign;            /* +1 or -1 */
+	double scale; /* radians (or rad/s) = sign * scale * (raw - zero); written `0.001deg` */
+	double zero;  /* raw counts */
+	int sign;     /* +1 or -1 */
 };
 
 struct config_device {
 	char name[CONFIG_NAME_MAX];
-	char driver[CONFIG_NAME_MAX];      /* lms2xx, modbus, pose */
-	int line;                          /* of the file, for messages */
+	char driver[CONFIG_NAME_MAX]; /* lms2xx, modbus, pose */
+	int line;                     /* of the file, for messages */
 
 	/* lms2xx */
 	char port[CONFIG_TEXT_MAX];
-	uint32_t baud;                     /* lms2xx: 9600, 19200, 38400, 500000; modbus rtu: any */
-	int fov_deg;                       /* variant: 100 or 180 */
-	int resolution_cdeg;               /* variant: 100, 50 or 25 (180/0.25 is made of partial scans) */
+	uint32_t baud;       /* lms2xx: 9600, 19200, 38400, 500000; modbus rtu: any */
+	int fov_deg;         /* variant: 100 or 180 */
+	int resolution_cdeg; /* variant: 100, 50 or 25 (180/0.25 is made of partial scans) */
 	enum { UNIT_KEEP, UNIT_MM, UNIT_CM } range_unit; /* `unit` of a scanner */
-	int mode;                          /* measuring mode to set, -1: respect the device's */
+	int mode;                                        /* measuring mode to set, -1: respect the device's */
 	double range_min_m, range_max_m;
-	struct { double from_rad, to_rad; } mask[SWEEP_MASKS_MAX];
+	struct {
+		double from_rad, to_rad;
+	} mask[SWEEP_MASKS_MAX];
 	int masks;
-	char tilt[CONFIG_NAME_MAX];        /* name of the device that tilts this one; empty: fixed */
+	char tilt[CONFIG_NAME_MAX]; /* name of the device that tilts this one; empty: fixed */
 	double tilt_fixed_rad;
 
 	/* modbus */
-	char connect[CONFIG_TEXT_MAX];     /* path of a serial line (RTU) or host:port (TCP) */
-	char parity;                       /* N, E, O */
-	int slave;                         /* `unit` of a Modbus device, 1..247 */
-	int64_t period_ns;                 /* between polls; 0: as fast as the answers come */
-	int address_base;                  /* 0 or 1 */
+	char connect[CONFIG_TEXT_MAX]; /* path of a serial line (RTU) or host:port (TCP) */
+	char parity;                   /* N, E, O */
+	int slave;                     /* `unit` of a Modbus device, 1..247 */
+	int64_t period_ns;             /* between polls; 0: as fast as the answers come */
+	int address_base;              /* 0 or 1 */
 	struct config_register position, target, speed;
-	struct { uint16_t address; uint16_t value; } write[CONFIG_WRITES_MAX]; /* sent once at start-up */
+	struct {
+		uint16_t address;
+		uint16_t value;
+	} write[CONFIG_WRITES_MAX]; /* sent once at start-up */
 	int writes;
 
 	/* pose */
-	char listen[CONFIG_TEXT_MAX];      /* unix:PATH or udp:HOST:PORT */
+	char listen[CONFIG_TEXT_MAX]; /* unix:PATH or udp:HOST:PORT */
 	bool fixed;
-	struct transform fixed_pose;       /* map <- base */
+	struct transform fixed_pose; /* map <- base */
 };
 
 struct config {
 	struct {
 		double cell_m;
 		bool planes, reduce;
-		double tolerance, snap;        /* cells */
-		int lookahead;                 /* rows */
-		uint64_t memory;               /* bytes */
+		double tolerance, snap; /* cells */
+		int lookahead;          /* rows */
+		uint64_t memory;        /* bytes */
 		int64_t hold_ns;
 	} map;
 	struct {
@@ -92,8 +97,8 @@ struct config {
 		char native[CONFIG_LISTEN_MAX][CONFIG_TEXT_MAX]; /* unix:PATH, tcp:HOST:PORT */
 		int natives;
 		char group[CONFIG_NAME_MAX];
-		int send_buffer;               /* bytes; 0: the system's */
-		int clients;                   /* at the limit: accept, say why, close */
+		int send_buffer; /* bytes; 0: the system's */
+		int clients;     /* at the limit: accept, say why, close */
 	} listen;
 };
 

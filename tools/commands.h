@@ -7,5 +7,6 @@ int reconstruct_main(int argc, char **argv);
 int watch_main(int argc, char **argv);
 int save_main(int argc, char **argv);
 int simulate_main(int argc, char **argv);
+int picture_main(int argc, char **argv);
 
 #endif

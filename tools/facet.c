@@ -13,7 +13,8 @@ struct command {
 static const struct command commands[] = {
     {"reconstruct", "files of points or scans into a mesh", reconstruct_main},
     {"watch", "what a running daemon does, live, in the terminal", NULL},
-    {"save", "a consistent snapshot of a running daemon's map", NULL},
+    {"save", "a consistent snapshot of a running daemon's map", save_main},
+    {"picture", "a mesh as a picture, from above with the ceiling cut off", picture_main},
     {"simulate", "simulated devices, and what to try on them", NULL},
     {"record", "record a running daemon", NULL},
     {"replay", "a recording into a mesh", NULL},

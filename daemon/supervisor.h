@@ -1,0 +1,57 @@
+/* The supervisor: keeps the devices alive. Every device is closed, configuring, streaming or backing off.
+ * It is handed the time and answers with a deadline; descriptors are watched by its host. One thread. */
+#ifndef FACET_DAEMON_SUPERVISOR_H
+#define FACET_DAEMON_SUPERVISOR_H
+
+#include "drivers/driver.h"
+
+#define SUPERVISOR_BACKOFF_MIN_NS 250000000ll  /* before the first new try; doubled with every failure ... */
+#define SUPERVISOR_BACKOFF_MAX_NS 2000000000ll /* ... up to here */
+#define SUPERVISOR_STEADY_NS      2000000000ll /* who streamed so long begins with the first again */
+#define SUPERVISOR_STOP_NS        1000000000ll /* an orderly end takes no longer */
+#define SUPERVISOR_READS_MAX      16           /* of one device in one turn of the loop */
+
+struct supervisor_host {
+	void *ctx;
+	/* Watch `fd` for reading, and for room to write if `writable`; -1: watch nothing for this device any more. */
+	void (*watch)(void *ctx, int device, int fd, bool writable);
+	/* A record was read or written: into the journal and the pipeline, which may call supervisor_reply and _data. */
+	void (*record)(void *ctx, const struct record *);
+	/* A transition; `priority` as in syslog.h. */
+	void (*log)(void *ctx, int device, int priority, const char *text);
+};
+
+enum supervisor_state { SUPERVISOR_CLOSED, SUPERVISOR_CONFIGURING, SUPERVISOR_STREAMING, SUPERVISOR_BACKING_OFF };
+
+struct supervisor_device {
+	enum supervisor_state state;
+	int64_t since_ns;
+	char error[160]; /* of the last failure; empty since it streams */
+	uint64_t records, bytes_in, bytes_out, opens, losses;
+	uint64_t decoded; /* profiles, angles or poses */
+};
+
+struct supervisor;
+
+/* `drivers`: of each device. The configuration is borrowed. NULL when memory is out. */
+struct supervisor *supervisor_create(const struct config *, const struct driver *const *drivers,
+                                     const struct supervisor_host *);
+void supervisor_destroy(struct supervisor *); /* closes what is open */
+
+void supervisor_start(struct supervisor *, int64_t t_ns);
+void supervisor_ready(struct supervisor *, int device, bool readable, bool writable, int64_t t_ns);
+void supervisor_timer(struct supervisor *, int64_t t_ns);
+int64_t supervisor_deadline(const struct supervisor *); /* call supervisor_timer then; INT64_MAX: nothing is due */
+
+/* From the pipeline, within host.record. */
+void supervisor_reply(struct supervisor *, int device, const struct reply *);
+void supervisor_data(struct supervisor *, int device, int64_t t_ns);
+
+/* The orderly end: devices are stopped, at most SUPERVISOR_STOP_NS long. */
+void supervisor_stop(struct supervisor *, int64_t t_ns);
+bool supervisor_stopped(const struct supervisor *);
+
+const struct supervisor_device *supervisor_device(const struct supervisor *, int device);
+const char *supervisor_state_name(enum supervisor_state);
+
+#endif

@@ -1,0 +1,508 @@
+/* Law: every device is kept alive by itself. A lost one comes back with bounded back-off, its transitions are told once,
+ * none can stall another, what is written is recorded, and an orderly end takes at most a second. All in virtual time. */
+#include <errno.h>
+#include <setjmp.h>
+#include <stdarg.h>
+#include <stddef.h>
+#include <stdint.h>
+#include <stdio.h>
+#include <stdlib.h>
+#include <string.h>
+
+#include <cmocka.h>
+
+#include "daemon/supervisor.h"
+
+#define MS      1000000ll
+#define SECOND  1000000000ll
+#define DEVICES 3
+
+/* A device of the test: it greets with "hi", must be answered "go", and then sends "d" for data. */
+struct link {
+	int device;
+};
+
+struct dialogue {
+	int device;
+	enum { GREETING, ASKED, LIVE, ENDING, ENDED, GIVEN_UP } phase;
+	int64_t deadline_ns;
+};
+
+static struct world {
+	bool absent, dead_read, dead_write, full, endless, never_ends, asks_without_end;
+	char pending[64]; /* what the device has to say */
+	char heard[64];   /* what it was told */
+	int opens, closes, bauds, flushes, resets;
+	uint32_t baud;
+	struct dialogue *dialogue;
+} world[DEVICES];
+
+static struct log_line {
+	int device;
+	char text[200];
+} log_lines[100];
+static int logs;
+static struct supervisor *supervisor;
+static char records[2000];
+static int watched[DEVICES];
+static bool watched_writable[DEVICES];
+
+static struct link *fake_open(const struct config_device *config, char error[160])
+{
+	int device = config->line;
+	struct link *link;
+
+	world[device].opens++;
+	if (world[device].absent) {
+		snprintf(error, 160, "/dev/fake%d is not there; plug it in", device);
+		return NULL;
+	}
+	link = calloc(1, sizeof(*link));
+	link->device = device;
+	return link;
+}
+
+static int fake_fd(const struct link *link)
+{
+	return 100 + link->device;
+}
+
+static ssize_t fake_read(struct link *link, uint8_t *buf, size_t cap, int64_t *t_ns)
+{
+	struct world *w = &world[link->device];
+	size_t n = strlen(w->pending);
+
+	(void)cap;
+	(void)t_ns;
+	if (w->dead_read)
+		return -EIO;
+	memcpy(buf, w->pending, n);
+	if (!w->endless)
+		w->pending[0] = 0;
+	return (ssize_t)n;
+}
+
+static ssize_t fake_write(struct link *link, const uint8_t *bytes, size_t len)
+{
+	struct world *w = &world[link->device];
+
+	if (w->dead_write)
+		return -EIO;
+	if (w->full)
+		return 0;
+	assert_true(len > 0);
+	strncat(w->heard, (const char *)bytes, 1); /* a byte at a time */
+	return 1;
+}
+
+static int fake_baud(struct link *link, uint32_t baud, char error[160])
+{
+	world[link->device].bauds++;
+	world[link->device].baud = baud;
+	if (baud == 12345) {
+		snprintf(error, 160, "the line refuses 12345 Bd");
+		return -EINVAL;
+	}
+	return 0;
+}
+
+static void fake_flush(struct link *link)
+{
+	world[link->device].flushes++;
+}
+
+static void fake_close(struct link *link)
+{
+	world[link->device].closes++;
+	free(link);
+}
+
+static struct dialogue *fake_dialogue(const struct config *config, int device)
+{
+	struct dialogue *dialogue = calloc(1, sizeof(*dialogue));
+
+	(void)config;
+	dialogue->device = device;
+	world[device].dialogue = dialogue;
+	return dialogue;
+}
+
+static void fake_dialogue_destroy(struct dialogue *dialogue)
+{
+	free(dialogue);
+}
+
+static void fake_reset(struct dialogue *dialogue, int64_t t_ns)
+{
+	world[dialogue->device].resets++;
+	dialogue->phase = GREETING;
+	dialogue->deadline_ns = t_ns + SECOND;
+}
+
+static void fake_reply(struct dialogue *dialogue, const struct reply *reply)
+{
+	if (reply->kind == 'h' && dialogue->phase == GREETING)
+		dialogue->phase = ASKED;
+}
+
+static void fake_data(struct dialogue *dialogue, int64_t t_ns)
+{
+	dialogue->deadline_ns = t_ns + SECOND;
+}
+
+static void fake_step(struct dialogue *dialogue, int64_t t_ns, struct dialogue_step *ret)
+{
+	ret->state = dialogue->phase >= LIVE ? DIALOGUE_STREAMING : DIALOGUE_CONFIGURING;
+	if (world[dialogue->device].asks_without_end) {
+		ret->flush = true;
+		ret->deadline_ns = t_ns;
+		return;
+	}
+	if (dialogue->phase == ENDING) {
+		ret->deadline_ns = INT64_MAX;
+		if (!world[dialogue->device].never_ends)
+			ret->state = DIALOGUE_FAILED;
+		return;
+	}
+	if (t_ns >= dialogue->deadline_ns) {
+		ret->state = DIALOGUE_FAILED;
+		snprintf(ret->error, sizeof(ret->error), "it says nothing; check its plug");
+		return;
+	}
+	if (dialogue->phase == ASKED) {
+		memcpy(ret->write, "go", 2);
+		ret->write_len = 2;
+		ret->baud = 38400;
+		ret->flush = true;
+		dialogue->phase = LIVE;
+	}
+	ret->deadline_ns = dialogue->deadline_ns;
+}
+
+static void fake_stop(struct dialogue *dialogue, int64_t t_ns)
+{
+	(void)t_ns;
+	dialogue->phase = ENDING;
+}
+
+static const struct driver fake = {.name = "fake",
+                                   .dialogue_create = fake_dialogue,
+                                   .dialogue_destroy = fake_dialogue_destroy,
+                                   .dialogue_reset = fake_reset,
+                                   .dialogue_reply = fake_reply,
+                                   .dialogue_data = fake_data,
+                                   .dialogue_step = fake_step,
+                                   .dialogue_stop = fake_stop,
+                                   .link_open = fake_open,
+                                   .link_fd = fake_fd,
+                                   .link_read = fake_read,
+                                   .link_write = fake_write,
+                                   .link_baud = fake_baud,
+                                   .link_flush = fake_flush,
+                                   .link_close = fake_close};
+static const struct driver silent = {.name = "silent",
+                                     .link_open = fake_open,
+                                     .link_fd = fake_fd,
+                                     .link_read = fake_read,
+                                     .link_write = fake_write,
+                                     .link_close = fake_close};
+static const struct driver linkless = {.name = "linkless"};
+
+/* The host: what a pipeline does with the bytes. */
+static void host_watch(void *ctx, int device, int fd, bool writable)
+{
+	(void)ctx;
+	watched[device] = fd;
+	watched_writable[device] = writable;
+}
+
+static void host_record(void *ctx, const struct record *record)
+{
+	struct reply reply = {.t_ns = record->t_ns, .kind = record->bytes[0]};
+	char text[80];
+
+	(void)ctx;
+	snprintf(text, sizeof(text), "%d%c%.*s ", record->device, record->direction == TO_DEVICE ? '<' : '>',
+	         (int)record->len, (const char *)record->bytes);
+	if (strlen(records) + strlen(text) < sizeof(records))
+		strcat(records, text);
+	if (record->direction == TO_DEVICE)
+		return;
+	if (record->bytes[0] == 'd')
+		supervisor_data(supervisor, record->device, record->log_ns);
+	else
+		supervisor_reply(supervisor, record->device, &reply);
+}
+
+static void host_log(void *ctx, int device, int priority, const char *text)
+{
+	(void)ctx;
+	(void)priority;
+	assert_true(logs < 100);
+	log_lines[logs].device = device;
+	snprintf(log_lines[logs++].text, sizeof(log_lines[0].text), "%s", text);
+}
+
+static struct config config;
+
+static void start(const struct driver *a, const struct driver *b, const struct driver *c)
+{
+	const struct driver *drivers[DEVICES] = {a, b, c};
+	struct supervisor_host host = {NULL, host_watch, host_record, host_log};
+
+	memset(&config, 0, sizeof(config));
+	for (int i = 0; i < DEVICES && drivers[i]; i++, config.devices++)
+		config.device[i].line = i;
+	logs = 0;
+	records[0] = 0;
+	memset(watched, 0xff, sizeof(watched));
+	supervisor = supervisor_create(&config, drivers, &host);
+	assert_non_null(supervisor);
+}
+
+static void begin(const struct driver *a, const struct driver *b, const struct driver *c)
+{
+	memset(world, 0, sizeof(world));
+	start(a, b, c);
+	supervisor_start(supervisor, 0);
+}
+
+static void end(void)
+{
+	supervisor_destroy(supervisor);
+	for (int i = 0; i < DEVICES; i++)
+		assert_int_equal(watched[i], -1);
+}
+
+static void say(int device, const char *text, int64_t t_ns)
+{
+	snprintf(world[device].pending, sizeof(world[device].pending), "%s", text);
+	supervisor_ready(supervisor, device, true, false, t_ns);
+}
+
+static void expect_state(int device, enum supervisor_state state)
+{
+	assert_string_equal(supervisor_state_name(supervisor_device(supervisor, device)->state),
+	                    supervisor_state_name(state));
+}
+
+static void a_device_is_configured_then_streams(void **state)
+{
+	(void)state;
+	begin(&fake, NULL, NULL);
+	expect_state(0, SUPERVISOR_CONFIGURING);
+	assert_int_equal(watched[0], 100);
+	assert_int_equal(supervisor_deadline(supervisor), SECOND);
+	say(0, "hi", 10 * MS);
+	while (watched_writable[0])
+		supervisor_ready(supervisor, 0, false, true, 11 * MS);
+	expect_state(0, SUPERVISOR_STREAMING);
+	assert_string_equal(world[0].heard, "go");
+	assert_int_equal(world[0].baud, 38400);
+	assert_int_equal(world[0].flushes, 1);
+	assert_string_equal(records, "0>hi 0<g 0<o ");
+	assert_int_equal(logs, 1);
+	assert_string_equal(log_lines[0].text, "streaming");
+	say(0, "d", 900 * MS);
+	assert_int_equal(supervisor_device(supervisor, 0)->decoded, 1);
+	assert_int_equal(supervisor_deadline(supervisor), 1900 * MS);
+	end();
+	assert_int_equal(world[0].closes, 1);
+}
+
+static void the_rate_is_set_only_after_every_byte_is_written(void **state)
+{
+	(void)state;
+	begin(&fake, NULL, NULL);
+	world[0].full = true;
+	say(0, "hi", 10 * MS);
+	assert_true(watched_writable[0]);
+	assert_int_equal(world[0].bauds, 0);
+	world[0].full = false;
+	supervisor_ready(supervisor, 0, false, true, 20 * MS);
+	while (watched_writable[0])
+		supervisor_ready(supervisor, 0, false, true, 20 * MS);
+	assert_int_equal(world[0].bauds, 1);
+	assert_string_equal(world[0].heard, "go");
+	end();
+}
+
+static void a_device_that_takes_no_bytes_is_lost_after_a_while(void **state)
+{
+	(void)state;
+	begin(&fake, NULL, NULL);
+	world[0].full = true;
+	say(0, "hi", 0);
+	assert_int_equal(supervisor_deadline(supervisor), 2 * SECOND);
+	supervisor_timer(supervisor, 1900 * MS);
+	assert_int_equal(world[0].closes, 0);
+	supervisor_timer(supervisor, 2 * SECOND);
+	expect_state(0, SUPERVISOR_BACKING_OFF);
+	assert_int_equal(world[0].closes, 1);
+	end();
+}
+
+static void an_absent_device_is_tried_again_ever_more_slowly_and_told_once(void **state)
+{
+	static const int64_t pause[] = {250, 500, 1000, 2000, 2000, 2000};
+	int64_t t_ns = 0;
+
+	(void)state;
+	memset(world, 0, sizeof(world));
+	world[0].absent = true;
+	start(&fake, NULL, NULL);
+	supervisor_start(supervisor, 0);
+	for (int i = 0; i < 6; i++) {
+		expect_state(0, SUPERVISOR_BACKING_OFF);
+		assert_int_equal(supervisor_deadline(supervisor), t_ns + pause[i] * MS);
+		t_ns = supervisor_deadline(supervisor);
+		supervisor_timer(supervisor, t_ns);
+	}
+	assert_int_equal(world[0].opens, 7);
+	assert_int_equal(logs, 1);
+	assert_non_null(strstr(log_lines[0].text, "/dev/fake0"));
+	world[0].absent = false;
+	supervisor_timer(supervisor, supervisor_deadline(supervisor));
+	expect_state(0, SUPERVISOR_CONFIGURING);
+	end();
+}
+
+static void a_lost_device_comes_back_and_both_are_told(void **state)
+{
+	(void)state;
+	begin(&silent, NULL, NULL);
+	expect_state(0, SUPERVISOR_STREAMING);
+	for (int round = 0; round < 3; round++) {
+		int64_t t_ns = (10 + 10 * round) * SECOND;
+
+		world[0].dead_read = true;
+		supervisor_ready(supervisor, 0, true, false, t_ns);
+		expect_state(0, SUPERVISOR_BACKING_OFF);
+		assert_int_equal(watched[0], -1);
+		world[0].dead_read = false;
+		/* It had streamed steadily: the back-off begins with its first again. */
+		assert_int_equal(supervisor_deadline(supervisor), t_ns + 250 * MS);
+		supervisor_timer(supervisor, t_ns + 250 * MS);
+		expect_state(0, SUPERVISOR_STREAMING);
+	}
+	assert_int_equal(logs, 7);
+	assert_int_equal(supervisor_device(supervisor, 0)->losses, 3);
+	end();
+}
+
+static void a_device_that_fails_right_after_it_streams_backs_off_further(void **state)
+{
+	int64_t t_ns = 0;
+
+	(void)state;
+	begin(&silent, NULL, NULL);
+	world[0].dead_read = true;
+	for (int i = 0; i < 5; i++) {
+		supervisor_ready(supervisor, 0, true, false, t_ns);
+		t_ns = supervisor_deadline(supervisor);
+		supervisor_timer(supervisor, t_ns);
+	}
+	assert_int_equal(t_ns, (250 + 500 + 1000 + 2000 + 2000) * MS);
+	end();
+}
+
+static void a_silent_device_is_given_up_with_its_sentence(void **state)
+{
+	(void)state;
+	begin(&fake, NULL, NULL);
+	supervisor_timer(supervisor, SECOND);
+	expect_state(0, SUPERVISOR_BACKING_OFF);
+	assert_string_equal(supervisor_device(supervisor, 0)->error, "it says nothing; check its plug");
+	assert_int_equal(logs, 1);
+	supervisor_timer(supervisor, supervisor_deadline(supervisor));
+	assert_int_equal(world[0].resets, 2);
+	end();
+}
+
+static void a_failed_write_loses_the_device(void **state)
+{
+	(void)state;
+	begin(&fake, NULL, NULL);
+	world[0].dead_write = true;
+	say(0, "hi", 10 * MS);
+	expect_state(0, SUPERVISOR_BACKING_OFF);
+	assert_non_null(strstr(supervisor_device(supervisor, 0)->error, "writing"));
+	end();
+}
+
+static void no_device_stalls_another(void **state)
+{
+	(void)state;
+	begin(&silent, &fake, &silent);
+	world[0].endless = true;
+	world[1].asks_without_end = true;
+	say(0, "d", 10 * MS);
+	assert_int_equal(supervisor_device(supervisor, 0)->records, SUPERVISOR_READS_MAX);
+	supervisor_ready(supervisor, 1, true, false, 10 * MS);
+	assert_true(world[1].flushes > 0 && world[1].flushes < 200);
+	assert_true(supervisor_deadline(supervisor) > 10 * MS);
+	say(2, "d", 10 * MS);
+	assert_int_equal(supervisor_device(supervisor, 2)->decoded, 1);
+	end();
+}
+
+static void a_device_without_a_link_just_streams(void **state)
+{
+	(void)state;
+	begin(&linkless, NULL, NULL);
+	expect_state(0, SUPERVISOR_STREAMING);
+	assert_true(supervisor_deadline(supervisor) == INT64_MAX);
+	supervisor_stop(supervisor, 5);
+	assert_true(supervisor_stopped(supervisor));
+	end();
+}
+
+static void an_orderly_end_asks_every_device_and_waits_at_most_a_second(void **state)
+{
+	(void)state;
+	begin(&fake, &fake, &silent);
+	world[1].never_ends = true;
+	supervisor_stop(supervisor, 5 * MS);
+	expect_state(0, SUPERVISOR_CLOSED);
+	expect_state(2, SUPERVISOR_CLOSED);
+	assert_false(supervisor_stopped(supervisor));
+	assert_int_equal(supervisor_deadline(supervisor), 5 * MS + SECOND);
+	supervisor_timer(supervisor, 5 * MS + SECOND);
+	assert_true(supervisor_stopped(supervisor));
+	assert_true(supervisor_deadline(supervisor) == INT64_MAX);
+	end();
+}
+
+static void a_device_that_backs_off_ends_at_once(void **state)
+{
+	(void)state;
+	memset(world, 0, sizeof(world));
+	world[0].absent = true;
+	start(&fake, NULL, NULL);
+	supervisor_start(supervisor, 0);
+	supervisor_stop(supervisor, 1);
+	assert_true(supervisor_stopped(supervisor));
+	supervisor_timer(supervisor, 10 * SECOND);
+	assert_int_equal(world[0].opens, 1);
+	end();
+}
+
+int main(void)
+{
+	const struct CMUnitTest tests[] = {
+	    cmocka_unit_test(a_device_is_configured_then_streams),
+	    cmocka_unit_test(the_rate_is_set_only_after_every_byte_is_written),
+	    cmocka_unit_test(a_device_that_takes_no_bytes_is_lost_after_a_while),
+	    cmocka_unit_test(an_absent_device_is_tried_again_ever_more_slowly_and_told_once),
+	    cmocka_unit_test(a_lost_device_comes_back_and_both_are_told),
+	    cmocka_unit_test(a_device_that_fails_right_after_it_streams_backs_off_further),
+	    cmocka_unit_test(a_silent_device_is_given_up_with_its_sentence),
+	    cmocka_unit_test(a_failed_write_loses_the_device),
+	    cmocka_unit_test(no_device_stalls_another),
+	    cmocka_unit_test(a_device_without_a_link_just_streams),
+	    cmocka_unit_test(an_orderly_end_asks_every_device_and_waits_at_most_a_second),
+	    cmocka_unit_test(a_device_that_backs_off_ends_at_once),
+	};
+
+	return cmocka_run_group_tests(tests, NULL, NULL);
+}

@@ -83,7 +83,8 @@ static void decode_angle(struct decoder *d, const struct modbus_transaction *t, 
 	int64_t rtt_ns = t->t_answer_ns - t->t_request_ns;
 	struct tilt tilt = {.t_ns = t->t_request_ns + rtt_ns / 2};
 
-	if (t->function != position->function || t->address != modbus_wire_address(&d->device, position->address) ||
+	if (t->function != modbus_wire_read_function(position) ||
+	    t->address != modbus_wire_address(&d->device, position->address) ||
 	    t->n != modbus_wire_registers(position)) {
 		d->count[FOREIGN]++;
 		return;

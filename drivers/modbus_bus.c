@@ -271,7 +271,7 @@ static int serve_wish(struct bus *bus)
 static int poll_position(struct bus *bus)
 {
 	const struct config_register *position = &bus->device.position;
-	struct modbus_transaction t = {.function = position->function,
+	struct modbus_transaction t = {.function = modbus_wire_read_function(position),
 	                               .address = modbus_wire_address(&bus->device, position->address),
 	                               .n = (uint16_t)modbus_wire_registers(position)};
 

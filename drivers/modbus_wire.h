@@ -45,6 +45,12 @@ size_t modbus_wire_put(const struct modbus_transaction *, uint8_t *ret);
 /* Length of the record at the start of `bytes`; 0: cut off; -EINVAL: no such transaction (function, unit, count). */
 ssize_t modbus_wire_get(const uint8_t *bytes, size_t len, struct modbus_transaction *ret);
 
+/* Function that reads this value: 3 unless 4 is asked for. */
+static inline uint8_t modbus_wire_read_function(const struct config_register *r)
+{
+	return r->function == 4 ? 4 : 3;
+}
+
 /* Registers that a value of this kind takes: 1 or 2. */
 int modbus_wire_registers(const struct config_register *);
 

@@ -8,9 +8,7 @@
  * config_sweep_params. The supervisor counts a link without a descriptor as streaming for ever. */
 #include "drivers/pose_line.h"
 
-#include <arpa/inet.h>
 #include <errno.h>
-#include <netinet/in.h>
 #include <stdio.h>
 #include <stdlib.h>
 #include <string.h>
@@ -19,6 +17,7 @@
 #include <sys/un.h>
 #include <unistd.h>
 
+#include "config/address.h"
 #include "drivers/driver.h"
 
 struct decoder {
@@ -104,11 +103,6 @@ static int open_unix(struct link *link, const char *path, char error[160])
 	struct stat st;
 	int r;
 
-	if (strlen(path) >= sizeof address.sun_path || !*path) {
-		snprintf(error, 160, "unix:%.40s...: a socket's path has 1 to %zu bytes", path,
-		         sizeof address.sun_path - 1);
-		return -1;
-	}
 	strcpy(address.sun_path, path);
 	link->fd = socket(AF_UNIX, SOCK_DGRAM | SOCK_NONBLOCK | SOCK_CLOEXEC, 0);
 	r = link->fd < 0 ? -errno : 0;
@@ -117,7 +111,7 @@ static int open_unix(struct link *link, const char *path, char error[160])
 	if (!r)
 		r = bind_path(link->fd, &address);
 	if (r) {
-		snprintf(error, 160, "unix:%s: %s", path,
+		snprintf(error, 160, "unix:%.90s: %s", path,
 		         r == -EADDRINUSE ? "somebody listens there already, or it is no socket" : strerror(-r));
 		return -1;
 	}
@@ -131,45 +125,20 @@ static int open_unix(struct link *link, const char *path, char error[160])
 	return 0;
 }
 
-/* "127.x.y.z", "[::1]" or "localhost", without a resolver that could block. */
-static int loopback(const char *text, struct sockaddr_storage *ret, socklen_t *ret_len)
+static int open_udp(struct link *link, const struct address *address, const char *text, char error[160])
 {
-	const char *colon = strrchr(text, ':');
-	struct sockaddr_in *v4 = (struct sockaddr_in *)ret;
-	struct sockaddr_in6 *v6 = (struct sockaddr_in6 *)ret;
-	char host[64], *end;
-	unsigned long port = colon ? strtoul(colon + 1, &end, 10) : 0;
-
-	if (!colon || end == colon + 1 || *end || port > 65535 || (size_t)(colon - text) >= sizeof host)
-		return -EINVAL;
-	memset(ret, 0, sizeof *ret);
-	snprintf(host, sizeof host, "%.*s", (int)(colon - text), text);
-	if (!strcmp(host, "[::1]")) {
-		*v6 = (struct sockaddr_in6){
-		    .sin6_family = AF_INET6, .sin6_port = htons((uint16_t)port), .sin6_addr = in6addr_loopback};
-		*ret_len = sizeof *v6;
-		return 0;
-	}
-	*v4 = (struct sockaddr_in){.sin_family = AF_INET, .sin_port = htons((uint16_t)port)};
-	*ret_len = sizeof *v4;
-	if (inet_pton(AF_INET, strcmp(host, "localhost") ? host : "127.0.0.1", &v4->sin_addr) != 1)
-		return -EINVAL;
-	return ntohl(v4->sin_addr.s_addr) >> 24 == 127 ? 0 : -EINVAL;
-}
-
-static int open_udp(struct link *link, const char *text, char error[160])
-{
-	struct sockaddr_storage address;
+	struct sockaddr_storage storage;
 	socklen_t len;
 
-	if (loopback(text, &address, &len) < 0) {
-		snprintf(error, 160, "udp:%.40s: poses are taken on loopback only; use udp:127.0.0.1:PORT or unix:PATH",
+	if (address_check_loopback(address, (char[ADDRESS_ERROR_MAX]){0}) < 0 ||
+	    address_sockaddr(address, &storage, &len) < 0) {
+		snprintf(error, 160, "%.40s: poses are taken on loopback only; use udp:127.0.0.1:PORT or unix:PATH",
 		         text);
 		return -1;
 	}
-	link->fd = socket(address.ss_family, SOCK_DGRAM | SOCK_NONBLOCK | SOCK_CLOEXEC, 0);
-	if (link->fd < 0 || bind(link->fd, (struct sockaddr *)&address, len) < 0) {
-		snprintf(error, 160, "udp:%.40s: %s", text, strerror(errno));
+	link->fd = socket(storage.ss_family, SOCK_DGRAM | SOCK_NONBLOCK | SOCK_CLOEXEC, 0);
+	if (link->fd < 0 || bind(link->fd, (struct sockaddr *)&storage, len) < 0) {
+		snprintf(error, 160, "%.80s: %s", text, strerror(errno));
 		return -1;
 	}
 	return 0;
@@ -191,7 +160,9 @@ static void link_close(struct link *link)
 static struct link *link_open(const struct config_device *device, char error[160])
 {
 	struct link *link = calloc(1, sizeof *link);
-	int r = 0;
+	char why[ADDRESS_ERROR_MAX] = "";
+	struct address address;
+	int r;
 
 	if (!link) {
 		snprintf(error, 160, "out of memory");
@@ -200,14 +171,13 @@ static struct link *link_open(const struct config_device *device, char error[160
 	link->fd = -1;
 	if (device->fixed)
 		return link;
-	if (!strncmp(device->listen, "unix:", 5)) {
-		r = open_unix(link, device->listen + 5, error);
-	} else if (!strncmp(device->listen, "udp:", 4)) {
-		r = open_udp(link, device->listen + 4, error);
-	} else {
-		snprintf(error, 160, "%.60s is neither unix:PATH nor udp:HOST:PORT", device->listen);
-		r = -1;
-	}
+	r = address_parse(device->listen, ADDRESS_UNIX | ADDRESS_UDP, &address, why);
+	if (r)
+		snprintf(error, 160, "%.159s", why);
+	else if (address.kind == ADDRESS_UNIX)
+		r = open_unix(link, address.path, error);
+	else
+		r = open_udp(link, &address, device->listen, error);
 	if (!r)
 		return link;
 	link_close(link);

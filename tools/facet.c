@@ -15,7 +15,7 @@ static const struct command commands[] = {
     {"watch", "what a running daemon does, live, in the terminal", NULL},
     {"save", "a consistent snapshot of a running daemon's map", save_main},
     {"picture", "a mesh as a picture, from above with the ceiling cut off", picture_main},
-    {"simulate", "simulated devices, and what to try on them", NULL},
+    {"simulate", "simulated devices, and what to try on them", simulate_main},
     {"record", "record a running daemon", NULL},
     {"replay", "a recording into a mesh", NULL},
     {"info", "what is in a recording, scan or mesh", NULL},

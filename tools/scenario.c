@@ -1,0 +1,254 @@
+/* Joins simulated devices and a stage: the scanner on DIR/laser, the servo on DIR/servo (or on TCP), poses at 100 Hz to
+ * DIR/pose.sock, and DIR/facetd.yaml, which reaches them all and lets the daemon listen on DIR/facetd.sock.
+ *
+ * A pose goes out with the time it is true for, in CLOCK_REALTIME, as any localisation would stamp it. The offset
+ * between the two clocks is taken once, as the daemon does: a step of the wall clock moves neither. A datagram that
+ * nobody takes (no daemon yet, its queue full) is not sent again: the next one is newer. */
+#include "tools/scenario.h"
+
+#include <errno.h>
+#include <stdio.h>
+#include <stdlib.h>
+#include <string.h>
+#include <sys/socket.h>
+#include <sys/un.h>
+#include <time.h>
+#include <unistd.h>
+
+#include "config/address.h"
+#include "drivers/pose_line.h"
+#include "tools/output.h"
+
+#define POSE_MS  10
+#define UNIT     1    /* of the servo */
+#define LASER_BD 9600 /* as from the factory */
+#define MODE_15  0x05
+#define YAML_MAX 4096
+
+struct scenario {
+	struct scenario_params params;
+	struct stage stage;
+	struct sim_servo *servo;
+	struct sim_lms2xx *laser;
+	uv_timer_t *timer;
+	int pose_fd;
+	struct sockaddr_un pose_address;
+	int64_t realtime_ns; /* CLOCK_REALTIME - CLOCK_MONOTONIC */
+	bool ended;
+};
+
+bool scenario_is_world(const char *name)
+{
+	return strncmp(name, "uos:", 4) != 0 && strncmp(name, "profiles:", 9) != 0;
+}
+
+static int64_t clock_ns(clockid_t clock)
+{
+	struct timespec ts;
+
+	clock_gettime(clock, &ts);
+	return (int64_t)ts.tv_sec * 1000000000 + ts.tv_nsec;
+}
+
+/* ---- the configuration ---- */
+
+static int print_servo(const struct scenario_params *params, bool sweeps, int port, char *ret, size_t cap)
+{
+	char connect[160];
+
+	if (port)
+		snprintf(connect, sizeof connect, "127.0.0.1:%d", port);
+	else
+		snprintf(connect, sizeof connect, "%.140s/servo", params->dir);
+	/* A played recording waits for the servo's answers at every line, so it is polled faster. */
+	return snprintf(ret, cap,
+	                "  - {name: servo, driver: modbus, connect: \"%s\", parity: none, unit: %d, period: %s,\n"
+	                "     position: {function: 3, address: %d, type: i32, scale: 0.001deg, sign: -1},\n"
+	                "     target: {function: 16, address: %d, type: i32, scale: 0.001deg, sign: -1},\n"
+	                "     speed: {function: 16, address: %d, type: u32, scale: 0.001deg}}\n",
+	                connect, UNIT, sweeps ? "5ms" : "2ms", SIM_SERVO_POSITION, SIM_SERVO_TARGET, SIM_SERVO_SPEED);
+}
+
+int scenario_yaml(const struct scenario_params *params, bool sweeps, int servo_port, char *ret, size_t cap)
+{
+	const char *dir = params->dir;
+	char servo[1024];
+
+	print_servo(params, sweeps, servo_port, servo, sizeof servo);
+	/* A recording has every ray through one point; a played line waits for its reader, so its reader may wait too. */
+	int n =
+	    snprintf(ret, cap,
+	             "# Written by `facet simulate %s`: reaches its simulated devices.\n"
+	             "%s"
+	             "devices:\n"
+	             "  - {name: laser, driver: lms2xx, port: \"%s/laser\", baud: 500000, variant: 180/0.5,\n"
+	             "     range: [0.3, 30], tilt: servo}\n"
+	             "%s"
+	             "  - {name: pose, driver: pose, listen: \"unix:%s/pose.sock\"}\n"
+	             "%s"
+	             "listen: {native: [\"unix:%s/facetd.sock\"%s%s%s]}\n",
+	             scenario_is_world(params->name) ? params->name : "...",
+	             sweeps ? "mount: {base_tilt: {xyz: [0.2, 0, 0.4]}, tilt_laser: {xyz: [0, 0, 0.05]}}\n"
+	                    : "map: {hold: 1s}\n",
+	             dir, servo, dir,
+	             sweeps ? "sweep: {device: servo, from: -65deg, to: 45deg, speed: 30deg, profile: triangle}\n" : "",
+	             dir, params->tcp ? ", \"tcp:" : "", params->tcp ? params->tcp : "", params->tcp ? "\"" : "");
+
+	return n < 0 || (size_t)n >= cap ? -ENOSPC : n;
+}
+
+static int write_yaml(const struct scenario *s, char error[SCENARIO_ERROR_MAX])
+{
+	char yaml[YAML_MAX], path[128];
+	struct output_error why;
+	int n = scenario_yaml(&s->params, s->stage.sweeps, sim_servo_port(s->servo), yaml, sizeof yaml);
+
+	if (n < 0) {
+		snprintf(error, SCENARIO_ERROR_MAX, "the configuration has no room for these names");
+		return n;
+	}
+	snprintf(path, sizeof path, "%.110s/facetd.yaml", s->params.dir);
+	n = output_write(path, yaml, (size_t)n, &why);
+	if (n < 0)
+		snprintf(error, SCENARIO_ERROR_MAX, "%.290s", why.text);
+	return n;
+}
+
+/* ---- running ---- */
+
+static void send_pose(struct scenario *s, int64_t now_ns)
+{
+	struct pose pose = s->stage.pose(s->stage.ctx, now_ns);
+	char line[POSE_LINE_MAX];
+	int n;
+
+	pose.t_ns = now_ns + s->realtime_ns;
+	n = pose_line_print(&pose, line, sizeof line);
+	if (n > 0 &&
+	    sendto(s->pose_fd, line, (size_t)n, MSG_DONTWAIT | MSG_NOSIGNAL, (struct sockaddr *)&s->pose_address,
+	           sizeof s->pose_address) == n &&
+	    s->stage.pose_sent)
+		s->stage.pose_sent(s->stage.ctx);
+}
+
+static void on_timer(uv_timer_t *timer)
+{
+	struct scenario *s = timer->data;
+	int64_t now_ns = clock_ns(CLOCK_MONOTONIC);
+	char said[80];
+
+	send_pose(s, now_ns);
+	if (s->ended || !s->stage.ended(s->stage.ctx, now_ns, said))
+		return;
+	s->ended = true;
+	s->params.ended(s->params.ctx, said);
+}
+
+static int start_devices(struct scenario *s, uv_loop_t *loop, char error[SCENARIO_ERROR_MAX])
+{
+	char laser[128], servo[128];
+	struct sim_servo_params servo_params = {.rtu = s->params.tcp_servo ? NULL : servo,
+	                                        .tcp = "127.0.0.1:0",
+	                                        .slave = UNIT,
+	                                        .angle_rad = s->stage.angle_rad};
+	struct sim_lms2xx_params laser_params = {
+	    .link = laser, .fast = s->params.fast, .baud = LASER_BD, .mode = MODE_15, .millimetres = true};
+
+	snprintf(laser, sizeof laser, "%.110s/laser", s->params.dir);
+	snprintf(servo, sizeof servo, "%.110s/servo", s->params.dir);
+	s->servo = sim_servo_create(&servo_params, error);
+	if (!s->servo)
+		return -EIO;
+	s->stage.join(s->stage.ctx, s->servo);
+	s->laser = sim_lms2xx_create(loop, &laser_params, &s->stage.scene, error);
+	return s->laser ? 0 : -EIO;
+}
+
+static int start_poses(struct scenario *s, uv_loop_t *loop, char error[SCENARIO_ERROR_MAX])
+{
+	s->pose_address.sun_family = AF_UNIX;
+	snprintf(s->pose_address.sun_path, sizeof s->pose_address.sun_path, "%.90s/pose.sock", s->params.dir);
+	s->pose_fd = socket(AF_UNIX, SOCK_DGRAM | SOCK_CLOEXEC, 0);
+	s->timer = malloc(sizeof *s->timer);
+	if (s->pose_fd < 0 || !s->timer) {
+		snprintf(error, SCENARIO_ERROR_MAX, "no socket for the poses: %s", strerror(errno));
+		return -EIO;
+	}
+	s->realtime_ns = clock_ns(CLOCK_REALTIME) - clock_ns(CLOCK_MONOTONIC);
+	uv_timer_init(loop, s->timer);
+	s->timer->data = s;
+	uv_timer_start(s->timer, on_timer, 0, POSE_MS);
+	return 0;
+}
+
+/* Paths end up in a YAML file and in sockets. */
+static int check_dir(const char *dir, char error[SCENARIO_ERROR_MAX])
+{
+	if (strlen(dir) + strlen("/facetd.sock") >= ADDRESS_PATH_MAX) {
+		snprintf(error, SCENARIO_ERROR_MAX,
+		         "%.120s...: too long for a directory with sockets (their paths have less than %d bytes); give "
+		         "a shorter --dir",
+		         dir, ADDRESS_PATH_MAX);
+		return -ENAMETOOLONG;
+	}
+	for (const char *c = dir; *c; c++)
+		if ((unsigned char)*c < ' ' || *c == '"' || *c == '\\') {
+			snprintf(
+			    error, SCENARIO_ERROR_MAX,
+			    "%.100s: a directory with quotes or control characters in its name; give another --dir",
+			    dir);
+			return -EINVAL;
+		}
+	return 0;
+}
+
+struct scenario *scenario_create(uv_loop_t *loop, const struct scenario_params *params, char error[SCENARIO_ERROR_MAX])
+{
+	struct scenario *s = calloc(1, sizeof *s);
+	int r;
+
+	if (!s) {
+		snprintf(error, SCENARIO_ERROR_MAX, "out of memory");
+		return NULL;
+	}
+	s->params = *params;
+	s->pose_fd = -1;
+	r = check_dir(params->dir, error);
+	if (!r && scenario_is_world(params->name))
+		r = drive_stage(params->name, params->seed, &s->stage, error);
+	else if (!r)
+		r = playback_stage(params->name, params->more, params->more_n, &s->stage, error);
+	if (!r)
+		r = start_devices(s, loop, error);
+	if (!r)
+		r = start_poses(s, loop, error);
+	if (!r)
+		r = write_yaml(s, error);
+	if (!r)
+		return s;
+	scenario_destroy(s);
+	return NULL;
+}
+
+static void free_handle(uv_handle_t *handle)
+{
+	free(handle);
+}
+
+void scenario_destroy(struct scenario *s)
+{
+	if (!s)
+		return;
+	if (s->timer && s->timer->data)
+		uv_close((uv_handle_t *)s->timer, free_handle);
+	else
+		free(s->timer);
+	if (s->laser)
+		sim_lms2xx_destroy(s->laser);
+	sim_servo_destroy(s->servo);
+	if (s->stage.destroy)
+		s->stage.destroy(s->stage.ctx);
+	if (s->pose_fd >= 0)
+		close(s->pose_fd);
+	free(s);
+}

@@ -1,0 +1,60 @@
+/* A scenario: the simulated devices, what moves under them, and the configuration that reaches them.
+ *
+ * What moves is a stage. A world's stage (drive.c) goes on by itself; a played recording's (playback.c) goes on when its
+ * reader does. Neither knows a device; the scenario joins them. */
+#ifndef FACET_TOOLS_SCENARIO_H
+#define FACET_TOOLS_SCENARIO_H
+
+#include "tools/simulator.h"
+
+#define SCENARIO_ERROR_MAX 300
+
+/* Times are CLOCK_MONOTONIC in ns. */
+struct stage {
+	void *ctx;
+	struct scene scene;
+	double angle_rad; /* where the servo stands at first, in its own sense: positive looks up */
+	bool sweeps;      /* the configuration lets the servo sweep */
+	/* The servo's simulator, once it exists. */
+	void (*join)(void *ctx, struct sim_servo *);
+	/* map <- base at t_ns. */
+	struct pose (*pose)(void *ctx, int64_t t_ns);
+	/* A datagram with the pose just asked for was taken by a reader. May be NULL. */
+	void (*pose_sent)(void *ctx);
+	/* Over? Then what there was, e.g. "played 678 lines". */
+	bool (*ended)(void *ctx, int64_t t_ns, char said[80]);
+	void (*destroy)(void *ctx);
+};
+
+/* 0, or -errno with one sentence. `seed` makes the range noise. */
+int drive_stage(const char *world, uint64_t seed, struct stage *ret, char error[SCENARIO_ERROR_MAX]);
+
+/* `source`: "uos:DIR" or "profiles:FILE.csv"; `more`: further files of the latter. */
+int playback_stage(const char *source, char *const *more, int n, struct stage *ret, char error[SCENARIO_ERROR_MAX]);
+
+struct scenario_params {
+	const char *name;  /* "building", "hall", "uos:DIR", "profiles:FILE.csv" */
+	char *const *more; /* further profile files */
+	int more_n;
+	const char *dir; /* absolute; exists */
+	bool fast;       /* playback without the wire's pace */
+	bool tcp_servo;  /* the servo on TCP instead of a pseudo-terminal */
+	const char *tcp; /* HOST:PORT where the daemon is to listen too, or NULL */
+	uint64_t seed;
+	void *ctx;
+	void (*ended)(void *ctx, const char *said); /* called once */
+};
+
+/* Is it a world, which goes on by itself (and takes no --speed)? */
+bool scenario_is_world(const char *name);
+
+struct scenario;
+/* Starts everything and writes DIR/facetd.yaml. NULL with one sentence. */
+struct scenario *scenario_create(uv_loop_t *, const struct scenario_params *, char error[SCENARIO_ERROR_MAX]);
+/* Closes the devices and removes their links; the loop must run once more to let go of the timer. */
+void scenario_destroy(struct scenario *);
+
+/* The configuration, as it is written. The length, or -ENOSPC. */
+int scenario_yaml(const struct scenario_params *, bool sweeps, int servo_port, char *ret, size_t cap);
+
+#endif

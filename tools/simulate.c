@@ -1,0 +1,458 @@
+/* `facet simulate`: starts a scenario's devices and, if asked for, the program to try on them.
+ *
+ * COMMAND gets a process group of its own, and everything ends together: when COMMAND ends, when the scenario is over
+ * (COMMAND then has two seconds to finish by itself), on SIGINT or SIGTERM. Ending is polite first: SIGTERM to COMMAND
+ * while the devices still answer; when it has gone, SIGTERM to what it left behind in its group; whoever is still there
+ * after a grace is killed. This process is the reaper of orphans, else a dead orphan would keep its group alive for the
+ * eye of kill(). Should this process be killed itself, COMMAND gets SIGTERM from the kernel. */
+#include <argp.h>
+#include <errno.h>
+#include <fcntl.h>
+#include <ftw.h>
+#include <limits.h>
+#include <signal.h>
+#include <stdio.h>
+#include <stdlib.h>
+#include <string.h>
+#include <sys/prctl.h>
+#include <sys/stat.h>
+#include <sys/wait.h>
+#include <unistd.h>
+#include <uv.h>
+
+#include "config/address.h"
+#include "tools/commands.h"
+#include "tools/scenario.h"
+
+#define AFTER_MS 2000  /* what COMMAND has after the scenario's end */
+#define GRACE_MS 10000 /* from SIGTERM to SIGKILL: a daemon that writes its map needs some of it */
+#define LOOK_MS  20
+#define SEED     1
+
+struct options {
+	const char *scenario, *dir, *tcp;
+	char *more[64];
+	int more_n;
+	bool fast, tcp_servo;
+	double speed;
+	uint64_t seed;
+	char **command; /* NULL: none */
+};
+
+struct simulation {
+	uv_loop_t loop;
+	uv_signal_t interrupt, terminate, child;
+	uv_timer_t after, look;
+	struct scenario *scenario;
+	char dir[PATH_MAX];
+	bool fresh;    /* made here: removed at the end */
+	pid_t command; /* 0: none, or gone */
+	pid_t group;
+	bool ending, over;
+	int64_t asked_ms; /* when the ending began */
+	int signalled;    /* how far it went: 1 COMMAND, 2 its group, 3 killed */
+	int status;
+};
+
+/* ---- the command line ---- */
+
+enum { OPTION_SPEED = 256, OPTION_SEED, OPTION_FAULT, OPTION_DIR, OPTION_TCP, OPTION_HTTP, OPTION_SERVO };
+
+static const struct argp_option option_list[] = {
+    {"dir", OPTION_DIR, "DIR", 0,
+     "where the devices, sockets and facetd.yaml are put (default: a fresh one, removed at the end)", 0},
+    {"speed", OPTION_SPEED, "X|max", 0, "max: recorded sweeps without the pace of the wire", 0},
+    {"seed", OPTION_SEED, "N", 0, "of the range noise of a world (default 1)", 0},
+    {"tcp", OPTION_TCP, "HOST:PORT", 0, "let the daemon listen here too, beside DIR/facetd.sock", 0},
+    {"servo", OPTION_SERVO, "rtu|tcp", 0, "the servo on a pseudo-terminal (default) or on TCP", 0},
+    {"fault", OPTION_FAULT, "SPEC", 0, "not yet: faults will come later", 0},
+    {"http", OPTION_HTTP, "HOST:PORT", 0, "not yet: the browser page will come later", 0},
+    {0},
+};
+
+static void parse_speed(struct argp_state *state, const char *arg, struct options *o)
+{
+	char *end;
+
+	o->fast = !strcmp(arg, "max");
+	o->speed = o->fast ? 0.0 : strtod(arg, &end);
+	if (!o->fast && (end == arg || *end || !(o->speed > 0.0 && o->speed <= 1000.0)))
+		argp_error(state, "--speed: '%s' is neither max nor a number from 0 to 1000", arg);
+}
+
+static void parse_seed(struct argp_state *state, const char *arg, struct options *o)
+{
+	char *end;
+
+	errno = 0;
+	o->seed = strtoull(arg, &end, 10);
+	if (end == arg || *end || errno || *arg == '-')
+		argp_error(state, "--seed: '%s' is not a whole number", arg);
+}
+
+static void parse_tcp(struct argp_state *state, const char *arg, struct options *o)
+{
+	char why[ADDRESS_ERROR_MAX];
+	struct address address;
+
+	if (address_parse_host(arg, &address, why) < 0 || address_check_loopback(&address, why) < 0)
+		argp_error(state, "--tcp: %s", why);
+	o->tcp = arg;
+}
+
+static void take_argument(struct argp_state *state, char *arg, struct options *o)
+{
+	if (!o->scenario)
+		o->scenario = arg;
+	else if (strncmp(o->scenario, "profiles:", 9) != 0)
+		argp_error(state, "'%s' is one word too many; a COMMAND comes after --", arg);
+	else if (o->more_n == (int)(sizeof o->more / sizeof *o->more))
+		argp_error(state, "too many files");
+	else
+		o->more[o->more_n++] = arg;
+}
+
+static error_t parse_option(int key, char *arg, struct argp_state *state)
+{
+	struct options *o = state->input;
+
+	switch (key) {
+	case OPTION_SPEED:
+		parse_speed(state, arg, o);
+		return 0;
+	case OPTION_SEED:
+		parse_seed(state, arg, o);
+		return 0;
+	case OPTION_DIR:
+		o->dir = arg;
+		return 0;
+	case OPTION_TCP:
+		parse_tcp(state, arg, o);
+		return 0;
+	case OPTION_SERVO:
+		o->tcp_servo = !strcmp(arg, "tcp");
+		if (!o->tcp_servo && strcmp(arg, "rtu"))
+			argp_error(state, "--servo: '%s' is neither rtu nor tcp", arg);
+		return 0;
+	case OPTION_FAULT:
+		argp_error(state, "--fault: not yet; faults will come later");
+		return 0;
+	case OPTION_HTTP:
+		argp_error(state, "--http: not yet; the browser page will come later");
+		return 0;
+	case ARGP_KEY_ARG:
+		take_argument(state, arg, o);
+		return 0;
+	case ARGP_KEY_NO_ARGS:
+		argp_error(state, "which scenario? building, hall, uos:DIR or profiles:FILE.csv");
+		return 0;
+	default:
+		return ARGP_ERR_UNKNOWN;
+	}
+}
+
+static const struct argp argp = {
+    .options = option_list,
+    .parser = parse_option,
+    .args_doc = "SCENARIO [FILE.csv...] [-- COMMAND...]",
+    .doc =
+        "Simulated devices, and what to try on them.\v"
+        "SCENARIO is a built-in world, `building` or `hall`, in which a robot drives with a sweeping scanner; or "
+        "recorded "
+        "sweeps that are played through the same devices: uos:DIR (scanNNN.3d with scanNNN.pose beside it) or "
+        "profiles:FILE.csv... (with its .pose beside it). Playback is paced by its reader and never skips a line.\n\n"
+        "COMMAND runs with FACETD_CONFIG set to the configuration that reaches the devices and FACETD to the address "
+        "of the "
+        "daemon. Everything ends when either ends.\n\n"
+        "  facet simulate building -- build/facetd",
+};
+
+/* What is behind `--` is COMMAND's and never looked at. */
+static void parse(int argc, char **argv, struct options *ret)
+{
+	int own = 1;
+
+	while (own < argc && strcmp(argv[own], "--") != 0)
+		own++;
+	*ret = (struct options){.speed = 1.0, .seed = SEED};
+	argp_parse(&argp, own, argv, 0, NULL, ret);
+	if (own < argc && !argv[own + 1]) {
+		fprintf(stderr, "facet: simulate: which COMMAND behind --?\n");
+		exit(2);
+	}
+	if (own < argc)
+		ret->command = argv + own + 1;
+	if (scenario_is_world(ret->scenario) && ret->speed != 1.0) {
+		fprintf(stderr,
+		        "facet: simulate: a world moves continuously and the daemon's clock is real: --speed is for "
+		        "recorded sweeps (uos:, profiles:)\n");
+		exit(2);
+	}
+}
+
+/* ---- the directory ---- */
+
+static int prepare_dir(struct simulation *s, const char *wanted)
+{
+	const char *base = getenv("XDG_RUNTIME_DIR");
+	char made[PATH_MAX];
+
+	if (wanted && mkdir(wanted, 0755) < 0 && errno != EEXIST)
+		return -errno;
+	if (wanted)
+		return realpath(wanted, s->dir) ? 0 : -errno;
+	if (!base || access(base, W_OK) < 0)
+		base = getenv("TMPDIR");
+	snprintf(made, sizeof made, "%.3000s/facet-XXXXXX", base && access(base, W_OK) == 0 ? base : "/tmp");
+	if (!mkdtemp(made) || !realpath(made, s->dir))
+		return -errno;
+	s->fresh = true;
+	return 0;
+}
+
+static int remove_entry(const char *path, const struct stat *st, int kind, struct FTW *ftw)
+{
+	(void)st;
+	(void)kind;
+	(void)ftw;
+	return remove(path);
+}
+
+/* ---- ending ---- */
+
+static int64_t now_ms(struct simulation *s)
+{
+	return (int64_t)uv_now(&s->loop);
+}
+
+static bool group_is_gone(const struct simulation *s)
+{
+	return s->group == 0 || (kill(-s->group, 0) < 0 && errno == ESRCH);
+}
+
+static void finish(struct simulation *s)
+{
+	uv_timer_stop(&s->look);
+	s->over = true;
+	uv_stop(&s->loop);
+}
+
+/* One step further on the way from a polite word to SIGKILL. */
+static void press(struct simulation *s)
+{
+	int64_t waited_ms = now_ms(s) - s->asked_ms;
+
+	if (s->signalled < 1 && s->command) {
+		kill(s->command, SIGTERM);
+		s->signalled = 1;
+	}
+	if (s->signalled < 2 && s->group && (!s->command || waited_ms > GRACE_MS / 2)) {
+		kill(-s->group, SIGTERM);
+		s->signalled = 2;
+	}
+	if (s->signalled < 3 && s->group && waited_ms > GRACE_MS) {
+		kill(-s->group, SIGKILL);
+		s->signalled = 3;
+	}
+}
+
+static void on_look(uv_timer_t *timer)
+{
+	struct simulation *s = timer->data;
+
+	if (!s->command && group_is_gone(s)) {
+		finish(s);
+		return;
+	}
+	press(s);
+}
+
+static void begin_ending(struct simulation *s)
+{
+	if (s->ending)
+		return;
+	s->ending = true;
+	s->asked_ms = now_ms(s);
+	uv_timer_stop(&s->after);
+	uv_timer_start(&s->look, on_look, 0, LOOK_MS);
+}
+
+static void on_signal(uv_signal_t *handle, int number)
+{
+	struct simulation *s = handle->data;
+
+	if (!s->ending)
+		s->status = 128 + number;
+	begin_ending(s);
+}
+
+static void on_child(uv_signal_t *handle, int number)
+{
+	struct simulation *s = handle->data;
+	int status;
+	pid_t pid;
+
+	(void)number;
+	while ((pid = waitpid(-1, &status, WNOHANG)) > 0) {
+		if (pid != s->command)
+			continue; /* an orphan of COMMAND's */
+		s->command = 0;
+		if (!s->ending)
+			s->status = WIFEXITED(status) ? WEXITSTATUS(status) : 128 + WTERMSIG(status);
+		begin_ending(s);
+	}
+}
+
+static void on_after(uv_timer_t *timer)
+{
+	begin_ending(timer->data);
+}
+
+static void on_ended(void *ctx, const char *said)
+{
+	struct simulation *s = ctx;
+
+	puts(said);
+	uv_timer_start(&s->after, on_after, AFTER_MS, 0);
+}
+
+/* ---- COMMAND ---- */
+
+static void run_command(const struct simulation *s, char **command, pid_t parent)
+{
+	char config[PATH_MAX + 16], address[PATH_MAX + 24];
+	sigset_t none;
+
+	setpgid(0, 0);
+	prctl(PR_SET_PDEATHSIG, SIGTERM);
+	if (getppid() != parent)
+		_exit(1);
+	sigemptyset(&none);
+	sigprocmask(SIG_SETMASK, &none, NULL);
+	if (isatty(STDIN_FILENO)) { /* a background group must not read the terminal */
+		int null = open("/dev/null", O_RDONLY);
+
+		if (null >= 0)
+			dup2(null, STDIN_FILENO);
+	}
+	snprintf(config, sizeof config, "%s/facetd.yaml", s->dir);
+	snprintf(address, sizeof address, "unix:%s/facetd.sock", s->dir);
+	setenv("FACETD_CONFIG", config, 1);
+	setenv("FACETD", address, 1);
+	execvp(command[0], command);
+	fprintf(stderr, "facet: simulate: %s: %s\n", command[0], strerror(errno));
+	_exit(127);
+}
+
+static int start_command(struct simulation *s, char **command)
+{
+	pid_t parent = getpid(), pid = fork();
+
+	if (pid < 0)
+		return -errno;
+	if (pid == 0)
+		run_command(s, command, parent);
+	setpgid(pid, pid); /* whoever of the two comes first */
+	s->command = s->group = pid;
+	return 0;
+}
+
+/* ---- the whole ---- */
+
+static int start_loop(struct simulation *s)
+{
+	int r = uv_loop_init(&s->loop);
+
+	if (r < 0)
+		return r;
+	uv_signal_init(&s->loop, &s->interrupt);
+	uv_signal_init(&s->loop, &s->terminate);
+	uv_signal_init(&s->loop, &s->child);
+	uv_timer_init(&s->loop, &s->after);
+	uv_timer_init(&s->loop, &s->look);
+	s->interrupt.data = s->terminate.data = s->child.data = s->after.data = s->look.data = s;
+	uv_signal_start(&s->interrupt, on_signal, SIGINT);
+	uv_signal_start(&s->terminate, on_signal, SIGTERM);
+	uv_signal_start(&s->child, on_child, SIGCHLD);
+	signal(SIGPIPE, SIG_IGN);
+	prctl(PR_SET_CHILD_SUBREAPER, 1);
+	return 0;
+}
+
+static void close_handle(uv_handle_t *handle, void *arg)
+{
+	(void)arg;
+	if (!uv_is_closing(handle))
+		uv_close(handle, NULL);
+}
+
+static void stop_loop(struct simulation *s)
+{
+	scenario_destroy(s->scenario);
+	uv_run(&s->loop, UV_RUN_NOWAIT); /* what the devices closed goes first: it knows how to free itself */
+	uv_walk(&s->loop, close_handle, NULL);
+	uv_run(&s->loop, UV_RUN_DEFAULT);
+	uv_loop_close(&s->loop);
+}
+
+static void say_where(const struct simulation *s, const struct options *o)
+{
+	printf("devices in %s, configuration %s/facetd.yaml\n", s->dir, s->dir);
+	printf("address unix:%s/facetd.sock%s%s\n", s->dir, o->tcp ? " tcp:" : "", o->tcp ? o->tcp : "");
+}
+
+static int simulate(struct simulation *s, const struct options *o)
+{
+	struct scenario_params params = {.name = o->scenario,
+	                                 .more = o->more,
+	                                 .more_n = o->more_n,
+	                                 .dir = s->dir,
+	                                 .fast = o->fast,
+	                                 .tcp_servo = o->tcp_servo,
+	                                 .tcp = o->tcp,
+	                                 .seed = o->seed,
+	                                 .ctx = s,
+	                                 .ended = on_ended};
+	char error[SCENARIO_ERROR_MAX] = "";
+
+	s->scenario = scenario_create(&s->loop, &params, error);
+	if (!s->scenario) {
+		fprintf(stderr, "facet: simulate: %s\n", error);
+		return 1;
+	}
+	say_where(s, o);
+	fflush(stdout);
+	if (o->command && start_command(s, o->command) < 0) {
+		fprintf(stderr, "facet: simulate: %s: %s\n", o->command[0], strerror(errno));
+		return 1;
+	}
+	while (!s->over)
+		uv_run(&s->loop, UV_RUN_DEFAULT);
+	return s->status;
+}
+
+int simulate_main(int argc, char **argv)
+{
+	static struct simulation s;
+	struct options o;
+	int r;
+
+	parse(argc, argv, &o);
+	setvbuf(stdout, NULL, _IOLBF, 0);
+	r = prepare_dir(&s, o.dir);
+	if (r < 0) {
+		fprintf(stderr, "facet: simulate: %s: %s; give a --dir that can be written\n", o.dir ? o.dir : "/tmp",
+		        strerror(-r));
+		return 1;
+	}
+	r = start_loop(&s);
+	if (r < 0) {
+		fprintf(stderr, "facet: simulate: no event loop: %s\n", uv_strerror(r));
+		return 1;
+	}
+	r = simulate(&s, &o);
+	stop_loop(&s);
+	if (s.fresh)
+		nftw(s.dir, remove_entry, 8, FTW_DEPTH | FTW_PHYS);
+	return r;
+}

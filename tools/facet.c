@@ -12,7 +12,7 @@ struct command {
 
 static const struct command commands[] = {
     {"reconstruct", "files of points or scans into a mesh", reconstruct_main},
-    {"watch", "what a running daemon does, live, in the terminal", NULL},
+    {"watch", "what a running daemon does, live, in the terminal", watch_main},
     {"save", "a consistent snapshot of a running daemon's map", save_main},
     {"picture", "a mesh as a picture, from above with the ceiling cut off", picture_main},
     {"simulate", "simulated devices, and what to try on them", simulate_main},

@@ -8,6 +8,7 @@
 #include <strings.h>
 #include <time.h>
 
+#include "config/address.h"
 #include "config/units.h"
 #include "tools/client.h"
 #include "tools/commands.h"
@@ -127,9 +128,15 @@ static int write_map(const struct native_mirror *mirror, const struct job *job)
 }
 
 /* What can be known before the daemon is asked. */
-static int judge_output(const struct job *job)
+static int judge_job(const struct job *job)
 {
 	struct output_error error;
+	struct address address;
+	char sentence[ADDRESS_ERROR_MAX];
+	if (job->address && address_parse(job->address, ADDRESS_UNIX | ADDRESS_TCP, &address, sentence)) {
+		fprintf(stderr, "facet: %s\n", sentence);
+		return 2;
+	}
 	if (!is_json(job->output) && output_format(job->output) == OUTPUT_UNKNOWN) {
 		fprintf(stderr, "facet: %s: the ending names no format; use .ply, .obj, .stl, .glb or .json\n",
 		        job->output);
@@ -156,7 +163,7 @@ int save_main(int argc, char **argv)
 	struct job job = {.timeout_s = 30};
 	char error[CLIENT_ERROR_MAX];
 	argp_parse(&argp, argc, argv, 0, NULL, &job);
-	int status = judge_output(&job);
+	int status = judge_job(&job);
 	if (status)
 		return status;
 	struct client *client = client_open(job.address, 5000, error);

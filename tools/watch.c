@@ -1,0 +1,399 @@
+/* `facet watch`: asks a daemon for its status once a second and shows it: a table that is drawn over itself on a
+ * terminal, a line a second in a pipe. It only reads JSON lines, so watching costs the daemon nothing but that.
+ *
+ * The terminal is borrowed: a second screen and a hidden cursor, given back on every way out. Signals only set a flag and
+ * wake the wait between two questions. A daemon that goes away is asked again every second. */
+#include <argp.h>
+#include <errno.h>
+#include <poll.h>
+#include <signal.h>
+#include <stdio.h>
+#include <stdlib.h>
+#include <string.h>
+#include <sys/ioctl.h>
+#include <time.h>
+#include <unistd.h>
+
+#include <jansson.h>
+
+#include "config/address.h"
+#include "tools/client.h"
+#include "tools/commands.h"
+
+#define ANSWER_MS  2000
+#define CONNECT_MS 2000
+#define COLUMNS    100 /* where nobody knows */
+
+enum { OPTION_ONCE = 256, OPTION_JSON };
+
+struct watch {
+	const char *address;
+	bool once, json, terminal;
+	struct client *client;
+	char lost[CLIENT_ERROR_MAX]; /* why there is no client; empty: not said yet */
+};
+
+static volatile sig_atomic_t stopped;
+
+static void stop(int number)
+{
+	(void)number;
+	stopped = 1;
+}
+
+/* Figures -------------------------------------------------------------------------------------------------------- */
+
+static json_t *member(json_t *root, const char *path)
+{
+	char name[64];
+	while (root && *path) {
+		const size_t n = strcspn(path, ".");
+		snprintf(name, sizeof(name), "%.*s", (int)n, path);
+		root = json_object_get(root, name);
+		path += n + (path[n] == '.');
+	}
+	return root;
+}
+
+static double number(json_t *root, const char *path)
+{
+	return json_number_value(member(root, path));
+}
+
+static const char *string(json_t *root, const char *path)
+{
+	const char *text = json_string_value(member(root, path));
+	return text ? text : "";
+}
+
+/* 1234567 as 1,234,567. Several at once in one printf, so there are several places to put them. */
+static const char *grouped(double value)
+{
+	static char text[8][32];
+	static int next;
+	char digits[24];
+	char *out = text[next = (next + 1) % 8];
+	const int n = snprintf(digits, sizeof(digits), "%.0f", value < 0 || value > 1e15 ? 0 : value);
+	int at = 0;
+	for (int i = 0; i < n; i++) {
+		if (i && (n - i) % 3 == 0)
+			out[at++] = ',';
+		out[at++] = digits[i];
+	}
+	out[at] = '\0';
+	return out;
+}
+
+/* Members that are not zero, as `, name value`; at most a line of them. */
+static void put_counts(FILE *out, json_t *counts, const char *between)
+{
+	const char *name;
+	json_t *value;
+	json_object_foreach(counts, name, value) if (json_number_value(value) > 0)
+	{
+		fprintf(out, "%s%.40s %s", between, name, grouped(json_number_value(value)));
+		between = ", ";
+	}
+}
+
+static double reduction_percent(json_t *status)
+{
+	const double raw = number(status, "map_size.triangles_raw"), reduced = number(status, "map_size.triangles");
+	return raw > 0 ? 100 * (1 - reduced / raw) : 0;
+}
+
+/* The table ------------------------------------------------------------------------------------------------------- */
+
+static void put_devices(FILE *out, json_t *status)
+{
+	size_t i;
+	json_t *device;
+	fprintf(out, "%-14s %-8s %-12s %9s %14s  %s\n", "DEVICE", "DRIVER", "STATE", "RATE", "RECORDS", "NOTES");
+	json_array_foreach(member(status, "devices"), i, device)
+	{
+		fprintf(out, "%-14.31s %-8.12s %-12.16s %6.1f Hz %14s  %.120s", string(device, "name"),
+		        string(device, "driver"), string(device, "state"), number(device, "rate"),
+		        grouped(number(device, "records")), string(device, "error"));
+		put_counts(out, member(device, "counters"), string(device, "error")[0] ? ", " : "");
+		fputc('\n', out);
+	}
+}
+
+static void put_map(FILE *out, json_t *status)
+{
+	const double mb = 1048576;
+	fprintf(out, "rows       %s applied, %s not applied, %.1f a second", grouped(number(status, "rows.applied")),
+	        grouped(number(status, "rows.not_applied")), number(status, "rows.rate"));
+	put_counts(out, member(status, "rows.dropped"), "; dropped: ");
+	fprintf(out, "\nmap        step %s, cell %g cm, %s patches in %s blocks%s\n", grouped(number(status, "step")),
+	        100 * number(status, "cell"), grouped(number(status, "map_size.patches")),
+	        grouped(number(status, "map_size.blocks")), json_is_true(member(status, "paused")) ? ", PAUSED" : "");
+	fprintf(out, "triangles  %s raw, %s reduced (%.1f %% fewer)\n",
+	        grouped(number(status, "map_size.triangles_raw")), grouped(number(status, "map_size.triangles")),
+	        reduction_percent(status));
+	fprintf(out, "memory     %.1f of %.0f MB", number(status, "memory.used") / mb,
+	        number(status, "memory.cap") / mb);
+	if (number(status, "memory.refused_blocks") > 0)
+		fprintf(out, ", FULL: %s blocks refused", grouped(number(status, "memory.refused_blocks")));
+	fprintf(out, "\nqueue      %s of %s rows\n", grouped(number(status, "queue.length")),
+	        grouped(number(status, "queue.cap")));
+	fprintf(out, "latency    p50 %.1f ms, p99 %.1f ms from a profile's last byte to its commit\n",
+	        number(status, "latency_ms.p50"), number(status, "latency_ms.p99"));
+}
+
+static void put_clients(FILE *out, json_t *status)
+{
+	size_t i;
+	json_t *client;
+	fprintf(out, "clients    %zu\n", json_array_size(member(status, "clients")));
+	json_array_foreach(member(status, "clients"), i, client)
+	{
+		fprintf(out, "  %-8.16s %-20.40s step %s", string(client, "kind"), string(client, "address"),
+		        grouped(number(client, "step")));
+		if (number(client, "behind") > 0)
+			fprintf(out, ", %s behind", grouped(number(client, "behind")));
+		if (number(client, "aborts") > 0)
+			fprintf(out, ", %s batches given up", grouped(number(client, "aborts")));
+		fprintf(out, ", %.1f MB\n", number(client, "bytes") / 1e6);
+	}
+}
+
+static void put_table(FILE *out, const struct watch *watch, json_t *status)
+{
+	const int up = (int)number(status, "uptime");
+	fprintf(out, "facetd %s at %s, map %.8s generation %.0f, up %d:%02d:%02d\n\n", string(status, "version"),
+	        client_address(watch->client), string(status, "map"), number(status, "generation"), up / 3600,
+	        up / 60 % 60, up % 60);
+	put_devices(out, status);
+	fputc('\n', out);
+	put_map(out, status);
+	put_clients(out, status);
+}
+
+/* One line for logs and pipes. */
+static void put_line(FILE *out, json_t *status)
+{
+	size_t i;
+	json_t *device;
+	fprintf(out, "step %.0f patches %.0f triangles %.0f of %.0f memory %.1fMB latency %.1f/%.1fms clients %zu",
+	        number(status, "step"), number(status, "map_size.patches"), number(status, "map_size.triangles"),
+	        number(status, "map_size.triangles_raw"), number(status, "memory.used") / 1048576,
+	        number(status, "latency_ms.p50"), number(status, "latency_ms.p99"),
+	        json_array_size(member(status, "clients")));
+	json_array_foreach(member(status, "devices"), i, device) fprintf(
+	    out, " %.31s:%.16s:%.1fHz", string(device, "name"), string(device, "state"), number(device, "rate"));
+	fputc('\n', out);
+}
+
+/* The terminal ----------------------------------------------------------------------------------------------------- */
+
+static void terminal_begin(const struct watch *watch)
+{
+	if (watch->terminal)
+		fputs("\033[?1049h\033[?25l", stdout);
+}
+
+static void terminal_end(const struct watch *watch)
+{
+	if (watch->terminal) {
+		fputs("\033[?25h\033[?1049l", stdout);
+		fflush(stdout);
+	}
+}
+
+static void terminal_size(int *ret_columns, int *ret_rows)
+{
+	struct winsize size;
+	const bool known = ioctl(STDOUT_FILENO, TIOCGWINSZ, &size) == 0 && size.ws_col > 0 && size.ws_row > 1;
+	*ret_columns = known ? size.ws_col : COLUMNS;
+	*ret_rows = known ? size.ws_row : 24;
+}
+
+/* Draws over what is there, line by line, cut at the edges of the window; bytes that could steer it are left out. */
+static void terminal_draw(const char *text)
+{
+	int columns, rows;
+	terminal_size(&columns, &rows);
+	fputs("\033[H", stdout);
+	for (int row = 1; *text && row < rows; row++) {
+		const int n = (int)strcspn(text, "\n");
+		for (int i = 0; i < n && i < columns - 1; i++)
+			fputc((unsigned char)text[i] < ' ' || text[i] == 127 ? '?' : text[i], stdout);
+		fputs("\033[K\n", stdout);
+		text += n + (text[n] == '\n');
+	}
+	fputs("\033[J", stdout);
+	fflush(stdout);
+}
+
+/* The loop --------------------------------------------------------------------------------------------------------- */
+
+static void show_status(const struct watch *watch, const char *line, json_t *status)
+{
+	char *text = NULL;
+	size_t len;
+	if (watch->json) {
+		puts(line);
+		fflush(stdout);
+		return;
+	}
+	FILE *out = open_memstream(&text, &len);
+	if (!out)
+		return;
+	if (watch->terminal || watch->once)
+		put_table(out, watch, status);
+	else
+		put_line(out, status);
+	fclose(out);
+	if (watch->terminal)
+		terminal_draw(text);
+	else
+		fputs(text, stdout);
+	free(text);
+	fflush(stdout);
+}
+
+/* Says once why there is nothing to show. */
+static void show_loss(struct watch *watch, const char *why)
+{
+	char text[CLIENT_ERROR_MAX + 64];
+	if (watch->client) {
+		client_close(watch->client);
+		watch->client = NULL;
+	}
+	if (strcmp(watch->lost, why) == 0)
+		return;
+	snprintf(watch->lost, sizeof(watch->lost), "%s", why);
+	if (watch->terminal) {
+		snprintf(text, sizeof(text), "%s\n\nTrying again every second; Ctrl-C ends.\n", why);
+		terminal_draw(text);
+	} else {
+		fprintf(stderr, "facet: %s\n", why);
+	}
+}
+
+/* Asks and shows. 0, or -errno with a sentence. */
+static int ask(struct watch *watch, char error[CLIENT_ERROR_MAX])
+{
+	const char *line;
+	if (!watch->client)
+		watch->client = client_open(watch->address, CONNECT_MS, error);
+	if (!watch->client)
+		return -ENOTCONN;
+	int status = client_say(watch->client, "?STATUS", error);
+	if (status)
+		return status;
+	status = client_line(watch->client, ANSWER_MS, &line, error);
+	if (status == 0)
+		snprintf(error, CLIENT_ERROR_MAX, "%s: no answer within %d s", client_address(watch->client),
+		         ANSWER_MS / 1000);
+	if (status <= 0)
+		return status ? status : -ETIMEDOUT;
+	json_t *json = json_loads(line, 0, NULL);
+	if (strcmp(string(json, "class"), "STATUS") != 0) {
+		const char *why = string(json, "error");
+		snprintf(error, CLIENT_ERROR_MAX, "%s: %s", client_address(watch->client),
+		         why[0] ? why : "what answers there is not facetd");
+		json_decref(json);
+		return -EPROTO;
+	}
+	watch->lost[0] = '\0';
+	show_status(watch, line, json);
+	json_decref(json);
+	return 0;
+}
+
+static void wait_until(struct timespec *next, const sigset_t *mask)
+{
+	struct timespec now;
+	clock_gettime(CLOCK_MONOTONIC, &now);
+	if (now.tv_sec > next->tv_sec + 1) /* the machine slept: no burst of questions afterwards */
+		*next = now;
+	struct timespec left = {next->tv_sec - now.tv_sec, next->tv_nsec - now.tv_nsec};
+	if (left.tv_nsec < 0) {
+		left.tv_sec--;
+		left.tv_nsec += 1000000000;
+	}
+	if (left.tv_sec >= 0)
+		ppoll(NULL, 0, &left, mask);
+}
+
+static int run(struct watch *watch)
+{
+	char error[CLIENT_ERROR_MAX];
+	struct sigaction action = {.sa_handler = stop};
+	sigset_t signals, before;
+	struct timespec next;
+	int status = 0;
+	sigemptyset(&signals);
+	sigaddset(&signals, SIGINT);
+	sigaddset(&signals, SIGTERM);
+	sigaction(SIGINT, &action, NULL);
+	sigaction(SIGTERM, &action, NULL);
+	action.sa_handler = SIG_IGN;
+	sigaction(SIGPIPE, &action, NULL);
+	sigprocmask(SIG_BLOCK, &signals, &before);
+	clock_gettime(CLOCK_MONOTONIC, &next);
+	terminal_begin(watch);
+	do {
+		status = ask(watch, error);
+		if (status)
+			show_loss(watch, error);
+		if (watch->once || ferror(stdout))
+			break;
+		next.tv_sec++;
+		wait_until(&next, &before); /* the only place where signals come through */
+	} while (!stopped);
+	terminal_end(watch);
+	return watch->once && status ? 1 : 0;
+}
+
+static error_t parse_option(int key, char *arg, struct argp_state *state)
+{
+	struct watch *watch = state->input;
+	switch (key) {
+	case OPTION_ONCE:
+		watch->once = true;
+		return 0;
+	case OPTION_JSON:
+		watch->json = true;
+		return 0;
+	case ARGP_KEY_ARG:
+		if (watch->address)
+			argp_error(state, "one daemon is watched at a time; '%s' is the second", arg);
+		watch->address = arg;
+		return 0;
+	default:
+		return ARGP_ERR_UNKNOWN;
+	}
+}
+
+int watch_main(int argc, char **argv)
+{
+	static const struct argp_option options[] = {
+	    {"once", OPTION_ONCE, NULL, 0, "show it once; status 1 where no daemon answers", 0},
+	    {"json", OPTION_JSON, NULL, 0, "the status as JSON, one line a second", 0},
+	    {0}};
+	static const struct argp argp = {
+	    options,
+	    parse_option,
+	    "[ADDRESS]",
+	    "What a running daemon does, live.\v"
+	    "ADDRESS is unix:PATH or tcp:HOST:PORT; default: $FACETD, the user's own socket, "
+	    "the system's.",
+	    NULL,
+	    NULL,
+	    NULL};
+	struct watch watch = {0};
+	struct address address;
+	char sentence[ADDRESS_ERROR_MAX];
+	argp_parse(&argp, argc, argv, 0, NULL, &watch);
+	if (watch.address && address_parse(watch.address, ADDRESS_UNIX | ADDRESS_TCP, &address, sentence)) {
+		fprintf(stderr, "facet: %s\n", sentence);
+		return 2;
+	}
+	watch.terminal = isatty(STDOUT_FILENO) && !watch.once && !watch.json;
+	const int status = run(&watch);
+	client_close(watch.client);
+	return status;
+}

@@ -38,9 +38,11 @@
 #define TURN_RAD            (0.1 * TRIG_DEG)
 #define CUT_RAD             (5 * TRIG_DEG) /* between neighbouring rows of one raster */
 #define CUT_M               0.5
+#define NEAR_RAD            0.02
 #define SWEEP_ROWS_MAX      2048
 #define MIXED_JUMP_M        0.2f
 #define MIXED_LINE_M        0.02
+#define MIXED_RUN_SHARE     0.25f
 
 struct held {
 	struct profile profile;
@@ -231,9 +233,10 @@ static int64_t tilt_period_ns(const struct sweep *s)
 /* What surrounds the beams of a row: a walk through the rings, times never decreasing. */
 struct walk {
 	const struct sweep *s;
-	uint64_t tilt_next, pose_next; /* first samples later than the time asked for last */
-	int64_t tilt_limit_ns;         /* beyond the last tilt sample up to here */
-	double angle_rad, sine, cosine;
+	uint64_t tilt_next, pose_next;           /* first samples later than the time asked for last */
+	int64_t tilt_limit_ns;                   /* beyond the last tilt sample up to here */
+	double angle_rad, sine, cosine;          /* at the beam placed last */
+	double near_rad, near_sine, near_cosine; /* of an angle close by */
 	bool has_angle;
 	struct transform map_base;
 };
@@ -327,6 +330,26 @@ static int walk_pose(struct walk *w, int64_t t_ns)
 	return 0;
 }
 
+/* Sine and cosine of the angle: from those of one close by, since a servo turns by a fraction of a degree within a row.
+ * Up to NEAR_RAD what the two series leave out is below 1e-15. */
+static void walk_turn_to(struct walk *w, double angle)
+{
+	if (w->has_angle && angle == w->angle_rad)
+		return;
+	double d = angle - w->near_rad, dd = d * d;
+	if (!w->has_angle || fabs(d) > NEAR_RAD) {
+		w->near_rad = angle;
+		w->near_sine = trig_sin(angle);
+		w->near_cosine = trig_cos(angle);
+		d = dd = 0;
+	}
+	double sine = d * (1 - dd / 6 * (1 - dd / 20)), cosine = 1 - dd / 2 * (1 - dd / 12 * (1 - dd / 30));
+	w->has_angle = true;
+	w->angle_rad = angle;
+	w->sine = w->near_sine * cosine + w->near_cosine * sine;
+	w->cosine = w->near_cosine * cosine - w->near_sine * sine;
+}
+
 static struct vec3 turn_about_y(const struct walk *w, struct vec3 p)
 {
 	return (struct vec3){w->cosine * p.x + w->sine * p.z, p.y, w->cosine * p.z - w->sine * p.x};
@@ -348,12 +371,7 @@ static int place_beam(struct walk *w, int64_t t_ns, const double bearing[2], str
 		r = walk_pose(w, t_ns);
 	if (r)
 		return r;
-	if (!w->has_angle || angle != w->angle_rad) {
-		w->has_angle = true;
-		w->angle_rad = angle;
-		w->sine = trig_sin(angle);
-		w->cosine = trig_cos(angle);
-	}
+	walk_turn_to(w, angle);
 	struct vec3 origin = transform_point(&params->base_tilt, turn_about_y(w, params->tilt_laser.t));
 	beam->origin = transform_point(&w->map_base, origin);
 	beam->point = beam->origin;
@@ -607,15 +625,21 @@ static bool on_line(const float *range_m, uint32_t first, double step_rad)
 	return true;
 }
 
-/* One surface, seen at a slant: the range runs one way through i, and a fourth neighbour is on the line too. */
-static bool is_slanted(const float *range_m, const uint8_t *state, uint32_t n, uint32_t i, double step_rad)
+/* Does the range run on from `a` over `b` to the fourth, `c`, as it does along a wall? A step of next to nothing before a
+ * jump is the edge of something near: close to the scanner beams lie within 2 cm of each other, and of any radial line. */
+static bool runs_on(float a, float b, float c)
 {
-	bool rises = range_m[i - 1] < range_m[i] && range_m[i] < range_m[i + 1];
-	bool falls = range_m[i - 1] > range_m[i] && range_m[i] > range_m[i + 1];
-	if (!rises && !falls)
+	return (b - a) * (c - b) > 0 && fabsf(c - b) >= MIXED_RUN_SHARE * fabsf(b - a);
+}
+
+/* One surface, seen at a slant: the range runs one way through i, and a fourth neighbour is on the line too. */
+static bool is_slanted(const float *r, const uint8_t *state, uint32_t n, uint32_t i, double step_rad)
+{
+	if ((r[i] - r[i - 1]) * (r[i + 1] - r[i]) <= 0)
 		return false;
-	return (i >= 2 && is_valid(state[i - 2]) && on_line(range_m, i - 2, step_rad)) ||
-	       (i + 2 < n && is_valid(state[i + 2]) && on_line(range_m, i - 1, step_rad));
+	return (i >= 2 && is_valid(state[i - 2]) && runs_on(r[i], r[i - 1], r[i - 2]) && on_line(r, i - 2, step_rad)) ||
+	       (i + 2 < n && is_valid(state[i + 2]) && runs_on(r[i], r[i + 1], r[i + 2]) &&
+	        on_line(r, i - 1, step_rad));
 }
 
 void sweep_mark_mixed(const float *range_m, uint8_t *state, uint32_t n, double first_rad, double step_rad)

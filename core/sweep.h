@@ -58,7 +58,7 @@ const char *sweep_drop_name(enum sweep_drop);
 
 /* Marks mixed beams of a row of ranges in place (interfaces, section 3): pure, shared with readers of files.
  * A BEAM_OK beam that jumps by more than 20 cm to both its valid neighbours becomes BEAM_MIXED unless the range runs one
- * way through it and these three with one further neighbour lie within 2 cm of a line. */
+ * way through it and these three with one further neighbour, in which the run goes on, lie within 2 cm of a line. */
 void sweep_mark_mixed(const float *range_m, uint8_t *state, uint32_t n, double first_rad, double step_rad);
 
 #endif

@@ -37,6 +37,11 @@ static double room_range(struct vec3 d)
 	return range;
 }
 
+static int64_t row_time(int n)
+{
+	return 1000000000 + n * INT64_C(13333333);
+}
+
 /* Row `n` of a sweep of a tilting scanner, with a little noise that depends on the row alone. */
 static struct row *room_row(int n)
 {
@@ -45,7 +50,7 @@ static struct row *room_row(int n)
 	uint64_t noise = (uint64_t)n * 2654435761u + 1;
 	row->number = (uint64_t)n;
 	row->starts_sweep = n == 0;
-	row->t_ns = 1000000000ll + n * 13333333ll;
+	row->t_ns = row_time(n);
 	row->tilt_rad = tilt;
 	row->step_rad = 3.14159265358979 / (BEAMS - 1);
 	row->first_rad = -3.14159265358979 / 2;
@@ -125,13 +130,13 @@ static void times_and_versions_are_those_of_the_rows(void **state)
 	struct mesher *mesher = mesher_create();
 	struct patch_store *store = patch_store_create();
 	struct map *map = make_room(false, 10, mesher, store);
-	const int64_t t0 = room_row(0)->t_ns, t_end = t0 + (ROWS - 1) * 13333333ll;
+	const int64_t t0 = row_time(0), t_end = row_time(ROWS - 1);
 	assert_int_equal(map_time_ns(map), t_end);
 	uint64_t newest = 0;
 	int64_t youngest = t0;
 	for (struct patch *patch = NULL; (patch = patch_store_after(store, 0, patch));) {
 		assert_true(patch->version <= ROWS);
-		assert_int_equal(patch->t_last_ns, t0 + ((int64_t)patch->version - 1) * 13333333ll);
+		assert_int_equal(patch->t_last_ns, row_time((int)patch->version - 1));
 		assert_true(patch->t_first_ns >= t0 && patch->t_first_ns <= patch->t_last_ns);
 		newest = patch->version;
 		youngest = patch->t_first_ns > youngest ? patch->t_first_ns : youngest;
@@ -229,13 +234,14 @@ static void set_voxel(struct grid *grid, const int at[3], int16_t value)
 }
 
 /* A surface that wanders through the region, in a band, with noise and holes. */
+#define UNKNOWN_PERCENT 40
 static int16_t wandering(uint64_t *random, const int at[3])
 {
 	double x = at[0], y = at[1], z = at[2];
 	double d = z - 8 - 7 * sin(x * 0.11) * cos(y * 0.09) + (random_below(random, 1000) - 500) * 0.0008;
 	double e = x + 0.3 * y - 11 + (random_below(random, 1000) - 500) * 0.0008;
 	d = fabs(e) < fabs(d) ? e : d;
-	return fabs(d) > 3 || random_below(random, 100) < 6 ? VOXEL_UNKNOWN : (int16_t)lrint(d * 256);
+	return fabs(d) > 3 || random_below(random, 100) < UNKNOWN_PERCENT ? VOXEL_UNKNOWN : (int16_t)lrint(d * 256);
 }
 
 static bool reads(int patch, int i, int halo)
@@ -257,6 +263,17 @@ static struct map *wandering_map(bool reduce, uint64_t *random)
 	return map;
 }
 
+static bool both_signs_around(const struct grid *grid, const int at[3])
+{
+	int inside = 0, outside = 0;
+	for (int n = 0; n < 27; n++) {
+		int16_t v = grid_published(grid, at[0] + n % 3 - 1, at[1] + n / 3 % 3 - 1, at[2] + n / 9 - 1);
+		inside += v != VOXEL_UNKNOWN && v < 0;
+		outside += v >= 0;
+	}
+	return inside && outside;
+}
+
 static void change_voxel(struct map *map, uint64_t *random, int change, int ret_at[3])
 {
 	bool odd = (change + change / 48) & 1;
@@ -267,8 +284,24 @@ static void change_voxel(struct map *map, uint64_t *random, int change, int ret_
 	set_voxel(map_grid(map), ret_at, known && odd ? VOXEL_UNKNOWN : (int16_t)(random_below(random, 1001) - 500));
 }
 
-/* How many patches that were not marked (halo < 0: by the grid) are not what meshing everything gives. */
-static int stale_patches(bool reduce, int halo, int changes)
+static bool near_corner(struct patch_key key, const int at[3], int halo)
+{
+	return reads(key.x, at[0], halo) && reads(key.y, at[1], halo) && reads(key.z, at[2], halo);
+}
+
+/* Whether the patch as it is now equals the held one, which it replaces. */
+static bool still(const struct map *map, struct mesher *mesher, struct patch **held)
+{
+	struct patch *patch = map_mesh_patch(map, mesher, (*held)->key, NULL);
+	bool equal = patch_equal(*held, patch);
+	patch_unref(*held);
+	*held = patch;
+	return equal;
+}
+
+/* How many patches that the grid did not mark are not what meshing everything gives, judged around the voxel after every
+ * change and everywhere at the end. */
+static int stale_patches(bool reduce, int changes)
 {
 	uint64_t random = 4711;
 	struct map *map = wandering_map(reduce, &random);
@@ -283,19 +316,17 @@ static int stale_patches(bool reduce, int halo, int changes)
 		change_voxel(map, &random, change, at);
 		size_t dirty = map_take_dirty(map, &keys);
 		for (int n = 0; n < REGION_KEYS; n++) {
-			struct patch_key key = region_key(n);
-			bool marked =
-			    reads(key.x, at[0], halo) && reads(key.y, at[1], halo) && reads(key.z, at[2], halo);
-			for (size_t d = 0; d < dirty && halo < 0; d++)
-				marked |= !patch_key_compare(key, keys[d]);
-			struct patch *patch = map_mesh_patch(map, mesher, key, NULL);
-			stale += !marked && !patch_equal(held[n], patch);
-			patch_unref(held[n]);
-			held[n] = patch;
+			bool marked = false;
+			for (size_t d = 0; d < dirty; d++)
+				marked |= !patch_key_compare(held[n]->key, keys[d]);
+			if (near_corner(held[n]->key, at, 4))
+				stale += !still(map, mesher, &held[n]) && !marked;
 		}
 	}
-	for (int n = 0; n < REGION_KEYS; n++)
+	for (int n = 0; n < REGION_KEYS; n++) {
+		stale += !still(map, mesher, &held[n]);
 		patch_unref(held[n]);
+	}
 	mesher_destroy(mesher);
 	map_destroy(map);
 	return stale;
@@ -304,8 +335,64 @@ static int stale_patches(bool reduce, int halo, int changes)
 static void raw_and_reduced_patches_that_are_not_dirty_have_not_changed(void **state)
 {
 	(void)state;
-	assert_int_equal(stale_patches(false, -1, 96), 0);
-	assert_int_equal(stale_patches(true, -1, 480), 0);
+	assert_int_equal(stale_patches(false, 480), 0);
+	assert_int_equal(stale_patches(true, 240), 0);
+}
+
+/* A voxel `beyond` steps outside the patch, in line with an unknown corner beside a surface one step outside. */
+static bool aim(const struct grid *grid, uint64_t *random, struct patch_key key, int beyond, int ret_at[3])
+{
+	const int origin[3] = {key.x * PATCH_SIDE, key.y * PATCH_SIDE, key.z * PATCH_SIDE};
+	for (int tries = 0; tries < 2000; tries++) {
+		int axis = random_below(random, 3), next[3];
+		bool below = random_below(random, 2);
+		for (int a = 0; a < 3; a++)
+			ret_at[a] = next[a] = origin[a] + random_below(random, PATCH_SIDE + 1);
+		ret_at[axis] = origin[axis] + (below ? -beyond : PATCH_SIDE + beyond);
+		next[axis] = origin[axis] + (below ? -1 : PATCH_SIDE + 1);
+		if (grid_published(grid, next[0], next[1], next[2]) == VOXEL_UNKNOWN && both_signs_around(grid, next))
+			return true;
+	}
+	return false;
+}
+
+/* How many reduced patches change when a voxel `beyond` steps outside them does. */
+static int changed_from(int beyond, int changes)
+{
+	uint64_t random = 4711;
+	struct map *map = wandering_map(true, &random);
+	struct mesher *mesher = mesher_create();
+	int changed = 0;
+	for (int n = 0; n < REGION_KEYS; n++) {
+		struct patch *held = map_mesh_patch(map, mesher, region_key(n), NULL);
+		for (int change = 0; change < changes; change++) {
+			int at[3];
+			if (!held->nt || !aim(map_grid(map), &random, region_key(n), beyond, at))
+				break;
+			int16_t before = grid_published(map_grid(map), at[0], at[1], at[2]);
+			int16_t after =
+			    before != VOXEL_UNKNOWN ? VOXEL_UNKNOWN : (int16_t)(random_below(&random, 1001) - 500);
+			set_voxel(map_grid(map), at, after);
+			changed += !still(map, mesher, &held);
+			set_voxel(map_grid(map), at, before);
+			changed += !still(map, mesher, &held);
+		}
+		patch_unref(held);
+	}
+	mesher_destroy(mesher);
+	map_destroy(map);
+	return changed;
+}
+
+/* The reduction asks which cells beyond the patch's faces are complete, and these depend on filled corners one further:
+ * a halo of [-1, 17] instead of [-2, 18] would leave these patches stale. */
+static void a_halo_one_voxel_too_small_leaves_stale_patches(void **state)
+{
+	(void)state;
+	int changed = changed_from(2, 80);
+	print_message("note: %d reduced patches changed from two voxels outside\n", changed);
+	assert_true(changed > 0);
+	assert_int_equal(changed_from(3, 10), 0);
 }
 
 int main(void)
@@ -316,6 +403,7 @@ int main(void)
 	    cmocka_unit_test(a_patch_that_loses_its_surface_becomes_a_tombstone),
 	    cmocka_unit_test(the_patches_of_a_room_fit),
 	    cmocka_unit_test(raw_and_reduced_patches_that_are_not_dirty_have_not_changed),
+	    cmocka_unit_test(a_halo_one_voxel_too_small_leaves_stale_patches),
 	};
 	return cmocka_run_group_tests(tests, NULL, NULL);
 }

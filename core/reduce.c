@@ -6,6 +6,7 @@
 #include <errno.h>
 
 #include "core/border_fit.h"
+#include "core/region.h"
 #include "core/simplify.h"
 
 /* What is left of the mesh, vertices and triangles in their old order. */
@@ -56,6 +57,8 @@ int reduce_surface(const struct window *window, const struct surface *raw, const
 		return r;
 	border_fit(&s.mesh, &s.border, stats);
 	simplify_settle(&s);
-	r = simplify_collapse(&s, arena);
+	r = region_flatten(&s, arena, stats);
+	if (!r)
+		r = simplify_collapse(&s, arena);
 	return r ? r : gather(&s, arena, ret);
 }

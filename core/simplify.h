@@ -11,16 +11,19 @@
 #include "core/halfedge.h"
 #include "core/quadric.h"
 
+struct region_plane;
+
 struct simplify {
 	struct halfedge_mesh mesh;
 	struct border border;
-	struct vec3 *origin;      /* [nv] where the vertex was in the raw mesh, lattice units */
-	struct quadric *quadric;  /* [nv] of the raw triangles it stands for */
-	bool *fixed;              /* [nv] neither moves nor goes */
-	uint32_t *points;         /* [cap_nt] vertices that went, tested against this triangle: first of a list */
-	uint32_t *rim_points;     /* [3 cap_nt] vertices that went from this half-edge of an open rim */
-	uint32_t *next_point;     /* [nv] */
-	uint32_t *plane;          /* [cap_nt] planar region, or UINT32_MAX */
+	struct vec3 *origin;     /* [nv] where the vertex was in the raw mesh, lattice units */
+	struct quadric *quadric; /* [nv] of the raw triangles it stands for */
+	bool *fixed;             /* [nv] neither moves nor goes */
+	uint32_t *points;        /* [cap_nt] vertices that went, tested against this triangle: first of a list */
+	uint32_t *rim_points;    /* [3 cap_nt] vertices that went from this half-edge of an open rim */
+	uint32_t *next_point;    /* [nv] */
+	uint32_t *plane;         /* [cap_nt] planar region, or UINT32_MAX */
+	struct region_plane *region;
 	double tolerance_squared; /* lattice units, squared */
 	double rim_squared;       /* how far an open rim may move sideways, squared */
 };

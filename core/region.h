@@ -1,0 +1,21 @@
+/* Planar regions of a patch, re-triangulated from their outlines (thesis 4.2 - 4.4). */
+#ifndef FACET_CORE_REGION_H
+#define FACET_CORE_REGION_H
+
+#include "core/reduce.h"
+#include "core/simplify.h"
+
+/* A plane: normal * p + offset = 0, lattice units, unit normal. */
+struct region_plane {
+	struct vec3 normal;
+	double offset;
+};
+
+/* Finds the planar regions and numbers their triangles in s->plane, their planes in s->region; what lies within a region
+ * goes, its outline stays. A region that cannot be triangulated so stays as it is. 0 or -ENOMEM. */
+int region_flatten(struct simplify *s, struct arena *arena, struct reduce_stats *stats);
+
+/* The plane through `n` points nearest to them in the mean square, and that mean square. */
+struct region_plane region_fit(const struct vec3 *point, uint32_t n, double *ret_variance);
+
+#endif

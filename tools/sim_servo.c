@@ -139,6 +139,17 @@ static bool reads_position(const uint8_t *pdu)
 	return (pdu[0] == 3 || pdu[0] == 4) && address <= SIM_SERVO_POSITION && address + n >= SIM_SERVO_POSITION + 2;
 }
 
+static int speak_rtu(struct sim_servo *s)
+{
+	if (s->modbus)
+		modbus_free(s->modbus);
+	s->modbus = modbus_new_rtu("pty", 115200, 'N', 8, 1); /* the name is never opened */
+	if (!s->modbus || modbus_set_slave(s->modbus, s->slave) < 0 || modbus_set_socket(s->modbus, s->master) < 0)
+		return -errno;
+	modbus_set_byte_timeout(s->modbus, 0, REQUEST_US);
+	return 0;
+}
+
 /* One request of the current line. False: the line is lost. An answer counts with the angle it carries. */
 static bool serve(struct sim_servo *s)
 {
@@ -147,8 +158,9 @@ static bool serve(struct sim_servo *s)
 
 	if (n < 0)
 		return errno == EMBBADCRC || errno == ETIMEDOUT || errno == EMBBADDATA;
+	/* For another unit: libmodbus would take the next request for that unit's answer, but nobody else is on this line. */
 	if (n == 0)
-		return true; /* for another unit */
+		return s->port || speak_rtu(s) == 0;
 	if (s->port && request[header - 1] != s->slave && request[header - 1] != MODBUS_TCP_SLAVE)
 		return true;
 	pthread_mutex_lock(&s->lock);
@@ -200,8 +212,8 @@ static void *servo_thread(void *arg)
 			return NULL;
 		if (p[1].revents && s->port)
 			accept_client(s);
-		else if (p[1].revents)
-			serve(s);
+		else if (p[1].revents && !serve(s) && !s->modbus)
+			return NULL;
 		for (int i = 0; i < CLIENTS_MAX; i++)
 			if (p[2 + i].revents && s->client[i] >= 0)
 				serve_client(s, i);
@@ -230,10 +242,7 @@ static int open_pty(struct sim_servo *s, const char *link)
 	if (symlink(name, link) < 0)
 		return -errno;
 	strcpy(s->link, link);
-	s->modbus = modbus_new_rtu(name, 115200, 'N', 8, 1);
-	if (!s->modbus || modbus_set_slave(s->modbus, s->slave) < 0)
-		return -errno;
-	return modbus_set_socket(s->modbus, s->master) < 0 ? -errno : 0;
+	return speak_rtu(s);
 }
 
 static int open_tcp(struct sim_servo *s, const char *address)
@@ -253,6 +262,7 @@ static int open_tcp(struct sim_servo *s, const char *address)
 	if (s->listener < 0 || getsockname(s->listener, (struct sockaddr *)&bound, &len) < 0)
 		return -errno;
 	fcntl(s->listener, F_SETFD, FD_CLOEXEC);
+	modbus_set_byte_timeout(s->modbus, 0, REQUEST_US);
 	s->port = ntohs(bound.ss_family == AF_INET6 ? ((struct sockaddr_in6 *)&bound)->sin6_port
 	                                            : ((struct sockaddr_in *)&bound)->sin_port);
 	return 0;
@@ -263,7 +273,6 @@ static int start(struct sim_servo *s)
 	sigset_t all, before;
 	int r;
 
-	modbus_set_byte_timeout(s->modbus, 0, REQUEST_US);
 	s->map = modbus_mapping_new(0, 0, SIM_SERVO_REGISTERS, SIM_SERVO_REGISTERS);
 	if (!s->map || pipe2(s->stop, O_CLOEXEC) < 0)
 		return -errno;

@@ -7,7 +7,8 @@
  * Two kinds of streams ask for two rules, because a late telegram means two things:
  *  - A steady stream (a telegram each scan): a late one waited somewhere, and others wait behind it. It gets the time that
  *    was its turn, and so do those behind it, though they arrive at one instant. Only when the next is late too, and did not
- *    come at the heels of the first, was a telegram lost; then the missing periods are conceded. The phase is the least
+ *    come at the heels of the first, was a telegram lost; then the missing periods are conceded (after more of them where
+ *    arrivals are ragged). The phase is the least
  *    delay of the last runs of telegrams, so that a device that runs slow is followed; a quicker arrival moves it at once.
  *  - A stream with gaps (a slow line skips scans; a recording is played at its reader's pace): how many periods passed is
  *    told by the arrival alone, as the last grid point before it. Delays have to be below a period then, and the phase is
@@ -19,15 +20,18 @@
 
 #include <assert.h>
 
-#define GAP_NS      2000000000LL
-#define WAIT_MAX_NS 250000000LL /* no line keeps more than this for a host that stalls */
-#define STEADY      4           /* telegrams without a gap make a steady stream */
-#define RUN         32          /* telegrams whose least delay is taken */
+#define GAP_NS          2000000000LL
+#define WAIT_MAX_NS     250000000LL /* no line keeps more than this for a host that stalls */
+#define STEADY          4           /* telegrams without a gap make a steady stream */
+#define RUN             32          /* telegrams whose least delay is taken */
+#define PATIENCE        2           /* late telegrams running: one was lost */
+#define PATIENCE_RAGGED 16          /* ... where late ones were seen to be only late, */
+#define CALM            128         /* so many telegrams ago or less */
 
 void clock_filter_init(struct clock_filter *f, int64_t period_ns)
 {
 	assert(period_ns > 0);
-	*f = (struct clock_filter){.period_ns = period_ns};
+	*f = (struct clock_filter){.period_ns = period_ns, .patience = PATIENCE};
 }
 
 static void phases_fill(struct clock_filter *f, int n)
@@ -104,15 +108,27 @@ static int64_t stamp_steady(struct clock_filter *f, int64_t arrival_ns, int64_t 
 	return expected + least;
 }
 
+/* A late telegram and no other behind it: arrivals are ragged by more than a period, and lateness means less. */
+static void note_raggedness(struct clock_filter *f, bool only_late)
+{
+	f->calm = only_late ? 0 : f->calm + 1;
+	if (only_late)
+		f->patience = PATIENCE_RAGGED;
+	else if (f->calm > CALM)
+		f->patience = PATIENCE;
+}
+
 /* Periods that passed without a telegram, when this one came `delay_ns` after the one that was next. */
 static int64_t skipped_periods(struct clock_filter *f, int64_t delay_ns, bool at_heels)
 {
 	if (delay_ns < f->period_ns) {
+		note_raggedness(f, f->late > 0 && !at_heels);
 		f->late = 0;
 		return 0;
 	}
-	if (f->steady >= STEADY && delay_ns <= WAIT_MAX_NS && (f->late == 0 || at_heels)) {
-		f->late++;
+	bool steady = f->steady >= STEADY && delay_ns <= WAIT_MAX_NS;
+	if (steady && (at_heels || f->late + 1 < f->patience)) {
+		f->late += !at_heels;
 		return 0;
 	}
 	f->late = 0;

@@ -13,8 +13,10 @@ struct clock_filter {
 	bool started;
 	int64_t last_ns; /* filtered time of the last arrival; the grid of possible times is this plus whole periods */
 	int64_t last_arrival_ns;
-	int steady; /* telegrams running that followed without a gap */
-	int late;   /* telegrams running that came a period or more after their time */
+	int steady;   /* telegrams running that followed without a gap */
+	int late;     /* telegrams running that came a period or more after their time */
+	int patience; /* so many of those mean that one was lost; more where arrivals are ragged */
+	int calm;     /* telegrams since arrivals were ragged */
 	/* A stream with gaps: how far the last arrivals were behind the grid, 0 .. period. */
 	int64_t phase_ns[CLOCK_FILTER_PHASES];
 	int phases, oldest;

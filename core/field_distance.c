@@ -22,6 +22,7 @@
 #define SAMPLE_STEP     0.7       /* cells */
 #define SAMPLES_MAX     32        /* along one side of a quad: bounds the cost of tiny cells */
 #define WEIGHT_BEAM     32.0      /* of a beam straight on */
+#define WEIGHT_SINGLE   1.0       /* of one that belongs to no surface */
 #define FLAT_SINE       0.0697565 /* sin(4 degrees) */
 #define FREE_MARGIN     (BAND_CELLS + 1)
 #define FREE_SINE_LEAST 0.1       /* a surface seen flatter than this keeps rays no farther off */
@@ -191,11 +192,16 @@ static void point_splat(struct field *field, struct vec3 point, struct vec3 view
 	field->stats.singles++;
 }
 
+/* A beam without a surface around it says where, but not which way: it weighs next to nothing, so that it completes cells
+ * that others began and leaves their surfaces alone. (With a beam's full weight and 2x2 columns, three sweeps came out 1.2
+ * points more complete, for 20 % more faces after the reduction: specks.) */
 static void single_add(struct field *field, const struct raster_line *line, int32_t c)
 {
 	struct vec3 view = vec3_sub(origin_of(field, line, c), line->point[c]);
+	struct fold_plane plane = fold_plane(view_axis(view), WEIGHT_SINGLE);
 
-	point_splat(field, line->point[c], view);
+	fold_sample(field->fold, &plane, line->point[c]);
+	field->stats.singles++;
 }
 
 static void ray_add(struct field *field, struct vec3 origin, struct vec3 point, struct vec3 normal)

@@ -25,7 +25,7 @@ int reader_fail(struct reader *r, int line, const char *format, ...)
 const char *reader_shown(const char *text, char ret[READER_SHOWN_MAX])
 {
 	size_t n = 0;
-	while (text[n] && n < READER_SHOWN_MAX - 4) {
+	while (n < READER_SHOWN_MAX - 4 && text[n]) {
 		ret[n] = iscntrl((unsigned char)text[n]) ? '?' : text[n];
 		n++;
 	}

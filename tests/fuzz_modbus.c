@@ -1,0 +1,101 @@
+/* Laws L7 and L8: no recorded bytes crash the servo's decoder or its dialogue, or give an angle that is no number; a
+ * record that is taken is written again byte for byte. The first two bytes choose how the registers are read. */
+#include <math.h>
+#include <stdint.h>
+#include <stdlib.h>
+#include <string.h>
+
+#include "drivers/modbus_parts.h"
+
+int LLVMFuzzerTestOneInput(const uint8_t *data, size_t size);
+
+static void must(bool condition)
+{
+	if (!condition)
+		abort();
+}
+
+static void take_tilt(void *ctx, int device, const struct tilt *tilt)
+{
+	(void)ctx;
+	(void)device;
+	must(isfinite(tilt->angle_rad));
+}
+
+static void take_reply(void *ctx, int device, const struct reply *reply)
+{
+	struct dialogue_step step;
+
+	(void)device;
+	driver_modbus.dialogue_reply(ctx, reply);
+	driver_modbus.dialogue_step(ctx, reply->t_ns, &step);
+	must(step.write_len <= sizeof step.write);
+	must(strlen(step.error) < sizeof step.error);
+}
+
+static struct config config_of(uint8_t how, uint8_t sweep)
+{
+	struct config config = {.devices = 1};
+	struct config_device *d = &config.device[0];
+	struct config_register r = {.set = true,
+	                            .function = how & 64 ? 4 : 3,
+	                            .type = (how & 7) % 5,
+	                            .order = how >> 3 & 3,
+	                            .scale = 1e-5,
+	                            .zero = how & 128 ? 1000.0 : 0.0,
+	                            .sign = how & 32 ? -1 : 1};
+
+	strcpy(d->name, "servo");
+	d->slave = 1;
+	d->position = d->target = d->speed = r;
+	d->target.address = 2;
+	d->speed.address = 4;
+	config.sweep.set = sweep & 1;
+	strcpy(config.sweep.device, "servo");
+	config.sweep.from_rad = -0.2;
+	config.sweep.to_rad = 0.1;
+	config.sweep.speed_rad_s = 0.05;
+	config.sweep.profile = (sweep >> 1 & 3) % 3;
+	config.sweep.step_rad = 0.03;
+	return config;
+}
+
+static void must_write_the_same(const uint8_t *data, size_t size)
+{
+	struct modbus_transaction t;
+	uint8_t back[MODBUS_WIRE_MAX];
+	ssize_t n = modbus_wire_get(data, size, &t);
+
+	if (n <= 0)
+		return;
+	must((size_t)n <= size);
+	must(modbus_wire_put(&t, back) == (size_t)n);
+	must(memcmp(back, data, (size_t)n) == 0);
+}
+
+int LLVMFuzzerTestOneInput(const uint8_t *data, size_t size)
+{
+	struct config config;
+	struct decoder *decoder;
+	struct dialogue *dialogue;
+	struct record record = {.bytes = data + 2};
+
+	if (size < 2)
+		return 0;
+	config = config_of(data[0], data[1]);
+	decoder = driver_modbus.decoder_create(&config.device[0], 0);
+	dialogue = driver_modbus.dialogue_create(&config, 0);
+	must(decoder && dialogue);
+	struct record_sink sink = {.ctx = dialogue, .tilt = take_tilt, .reply = take_reply};
+
+	driver_modbus.dialogue_reset(dialogue, 0);
+	record.len = size - 2;
+	must_write_the_same(record.bytes, record.len);
+	driver_modbus.decode(decoder, &record, &sink);
+	record.direction = TO_DEVICE;
+	driver_modbus.decode(decoder, &record, &sink);
+	driver_modbus.dialogue_stop(dialogue, 1);
+	driver_modbus.dialogue_destroy(dialogue);
+	driver_modbus.decoder_destroy(decoder);
+	return 0;
+}

@@ -30,10 +30,11 @@ struct pipeline *pipeline_create(const struct config *, const struct pipeline_si
 void pipeline_destroy(struct pipeline *);
 
 void pipeline_handle(struct pipeline *, const struct record *);
-void pipeline_tick(struct pipeline *, int64_t log_ns); /* the recorded 10 Hz tick */
+void pipeline_tick(struct pipeline *, int64_t log_ns);  /* the recorded 10 Hz tick */
 void pipeline_skip(struct pipeline *, uint64_t number); /* replay: this row was not applied live */
 void pipeline_end(struct pipeline *);                   /* end of the input: hand out what waits, then flush */
-void pipeline_reset(struct pipeline *); /* a new map: rows are numbered from 0 again, the numbers to skip are forgotten */
+void pipeline_reset(
+    struct pipeline *); /* a new map: rows are numbered from 0 again, the numbers to skip are forgotten */
 
 /* Within the sink's `row`: log time of the last byte of the profile that the row is made of. */
 int64_t pipeline_arrival_ns(const struct pipeline *);

@@ -7,7 +7,8 @@
 
 #define WORKER_ROWS_MAX    256 /* rows waiting; a further one is refused: it is not applied, and the caller says so */
 #define WORKER_RESULTS_MAX 8   /* results not yet taken; at the limit the worker waits, so rows pile up instead */
-#define WORKER_MESH_ROWS   32 /* at the latest after so many rows the dirty patches are meshed, however long the queue \
+#define WORKER_MESH_ROWS \
+	32 /* at the latest after so many rows the dirty patches are meshed, however long the queue \
 	                       */
 
 struct worker_params {

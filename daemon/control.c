@@ -1,0 +1,273 @@
+/* Words of clients and answers to them, in gpsd's manner: a question begins with `?`, an answer is one JSON object on
+ * one line with its `class` first. What is known but not there yet is refused by its name, so that nobody mistakes a
+ * missing feature for a misspelt one. Jansson does the JSON; its refusal of duplicate keys and of depth bounds the rest. */
+#include "daemon/control.h"
+
+#include <errno.h>
+#include <jansson.h>
+#include <stdio.h>
+#include <stdlib.h>
+#include <string.h>
+
+static const char *const words[] = {"STATUS", "WATCH", "PAUSE", "RESUME", "RESET"};
+
+static const struct {
+	const char *word, *sentence;
+} later[] = {
+    {"SAVE", "?SAVE is not done by the daemon: run `facet save ADDRESS -o FILE`"},
+    {"RECORD", "?RECORD comes in a later version"},
+    {"SWEEP", "?SWEEP comes in a later version: set `sweep` in the configuration"},
+    {"SEEK", "?SEEK comes in a later version"},
+};
+
+const char *control_name(enum control_word word)
+{
+	return words[word];
+}
+
+bool control_changes(enum control_word word)
+{
+	return word == CONTROL_PAUSE || word == CONTROL_RESUME || word == CONTROL_RESET;
+}
+
+static int refuse(char error[200], const char *sentence)
+{
+	snprintf(error, 200, "%s", sentence);
+	return -EINVAL;
+}
+
+static int find_word(const char *word, enum control_word *ret, char error[200])
+{
+	for (size_t i = 0; i < sizeof(words) / sizeof(words[0]); i++)
+		if (strcmp(words[i], word) == 0) {
+			*ret = (enum control_word)i;
+			return 0;
+		}
+	for (size_t i = 0; i < sizeof(later) / sizeof(later[0]); i++)
+		if (strcmp(later[i].word, word) == 0) {
+			snprintf(error, 200, "%s", later[i].sentence);
+			return -ENOTSUP;
+		}
+	return refuse(error, "not a command: say ?STATUS, ?WATCH={\"enable\":true}, ?PAUSE, ?RESUME or ?RESET");
+}
+
+static int read_arguments(json_t *arguments, struct control_command *command, char error[200])
+{
+	json_t *enable = json_object_get(arguments, "enable");
+
+	command->enable = true;
+	if (arguments && !json_is_object(arguments))
+		return refuse(error, "what follows `=` is a JSON object, e.g. ?WATCH={\"enable\":true}");
+	if (enable && !json_is_boolean(enable))
+		return refuse(error, "`enable` is true or false");
+	if (enable)
+		command->enable = json_is_true(enable);
+	return 0;
+}
+
+static json_t *load(const char *text, size_t len)
+{
+	return json_loadb(text, len, JSON_REJECT_DUPLICATES, NULL);
+}
+
+/* ?WORD or ?WORD={...} */
+static int parse_question(const char *text, size_t len, struct control_command *command, char error[200])
+{
+	const char *equals = memchr(text, '=', len);
+	size_t word_len = equals ? (size_t)(equals - text) : len;
+	json_t *arguments = NULL;
+	char word[16] = "";
+	int r;
+
+	if (word_len < sizeof(word))
+		memcpy(word, text, word_len);
+	r = find_word(word, &command->word, error);
+	if (r < 0)
+		return r;
+	if (equals) {
+		arguments = load(equals + 1, len - word_len - 1);
+		if (!arguments)
+			return refuse(error, "what follows `=` is not valid JSON");
+	}
+	r = read_arguments(arguments, command, error);
+	json_decref(arguments);
+	return r;
+}
+
+static int parse_object(const char *text, size_t len, struct control_command *command, char error[200])
+{
+	json_t *object = load(text, len);
+	const char *word = json_string_value(json_object_get(object, "command"));
+	int r = refuse(error, "a line is ?WORD, ?WORD={...} or a JSON object with \"command\"");
+
+	if (word)
+		r = find_word(word, &command->word, error);
+	if (word && r == 0)
+		r = read_arguments(object, command, error);
+	json_decref(object);
+	return r;
+}
+
+static bool blank(char c)
+{
+	return c == ' ' || c == '\t' || c == '\r' || c == '\n' || c == ';';
+}
+
+int control_parse(const char *text, size_t len, struct control_command *ret, char error[200])
+{
+	struct control_command command = {0};
+	int r;
+
+	while (len > 0 && blank(text[len - 1]))
+		len--;
+	while (len > 0 && blank(*text)) {
+		text++;
+		len--;
+	}
+	if (len > 0 && *text == '?')
+		r = parse_question(text + 1, len - 1, &command, error);
+	else
+		r = parse_object(text, len, &command, error);
+	if (r == 0)
+		*ret = command;
+	return r;
+}
+
+/* Answers. Jansson's failures (memory) leave the text out; the reader then misses one message. */
+
+static void put(struct buffer *b, json_t *json)
+{
+	char *text = json ? json_dumps(json, JSON_COMPACT | JSON_REAL_PRECISION(15)) : NULL;
+
+	if (text)
+		buffer_append(b, text, strlen(text));
+	free(text);
+	json_decref(json);
+}
+
+void control_put_version(struct buffer *b)
+{
+	put(b, json_pack("{s:s, s:s, s:[i,i]}", "class", "VERSION", "release", FACET_VERSION, "protocol", NATIVE_MAJOR,
+	                 NATIVE_MINOR));
+}
+
+void control_put_answer(struct buffer *b, const struct control_command *command)
+{
+	if (command->word == CONTROL_WATCH)
+		put(b, json_pack("{s:s, s:b}", "class", "WATCH", "enable", command->enable));
+	else
+		put(b, json_pack("{s:s, s:s}", "class", "OK", "command", control_name(command->word)));
+}
+
+void control_put_error(struct buffer *b, const char *sentence)
+{
+	put(b, json_pack("{s:s, s:s}", "class", "ERROR", "error", sentence));
+}
+
+void control_put_device_event(struct buffer *b, const char *device, const char *state, const char *text)
+{
+	/* A driver's sentence may repeat a user's bytes, which need not be UTF-8 */
+	json_t *message = json_string(text);
+
+	put(b, json_pack("{s:s, s:s, s:s, s:o}", "class", "DEVICE", "name", device, "state", state, "message",
+	                 message ? message : json_string("(not UTF-8)")));
+}
+
+static json_t *integer(uint64_t value)
+{
+	return json_integer((json_int_t)value);
+}
+
+static json_t *rows_json(const struct control_status *s)
+{
+	json_t *dropped = json_object(), *beams = json_object();
+	static const char *const state[BEAM_STATES] = {"ok",           "no echo",       "dazzled",        "overflow",
+	                                               "weak",         "channel error", "beyond maximum", "reserved",
+	                                               "out of range", "masked",        "self",           "mixed"};
+
+	for (int i = 0; i < SWEEP_DROPS; i++)
+		json_object_set_new(dropped, sweep_drop_name((enum sweep_drop)i), integer(s->rows.sweep.dropped[i]));
+	json_object_set_new(dropped, "queue full", integer(s->rows.queue_full));
+	json_object_set_new(dropped, "paused", integer(s->rows.paused));
+	for (int i = 0; i < BEAM_STATES; i++)
+		json_object_set_new(beams, state[i], integer(s->rows.sweep.beams[i]));
+	return json_pack("{s:I, s:I, s:I, s:f, s:I, s:I, s:o, s:o}", "assembled", (json_int_t)s->rows.assembled,
+	                 "applied", (json_int_t)s->rows.applied, "not_applied", (json_int_t)s->rows.not_applied, "rate",
+	                 s->rows.rate, "profiles", (json_int_t)s->rows.sweep.profiles, "sweeps",
+	                 (json_int_t)s->rows.sweep.sweeps, "dropped", dropped, "beams", beams);
+}
+
+static json_t *devices_json(const struct control_status *s)
+{
+	json_t *list = json_array();
+
+	for (int i = 0; i < s->devices; i++) {
+		const struct supervisor_device *line = &s->device[i].line;
+		json_t *counters = json_object(), *error = json_string(line->error);
+
+		for (int k = 0; k < s->device[i].counters.n; k++)
+			json_object_set_new(counters, s->device[i].counters.counter[k].name,
+			                    integer(s->device[i].counters.counter[k].count));
+		json_array_append_new(
+		    list,
+		    json_pack("{s:s, s:s, s:s, s:f, s:f, s:I, s:I, s:I, s:I, s:I, s:o, s:o}", "name", s->device[i].name,
+		              "driver", s->device[i].driver, "state", supervisor_state_name(line->state), "since",
+		              (double)(s->t_ns - line->since_ns) / 1e9, "rate", s->device[i].rate, "records",
+		              (json_int_t)line->decoded, "bytes_in", (json_int_t)line->bytes_in, "bytes_out",
+		              (json_int_t)line->bytes_out, "opens", (json_int_t)line->opens, "losses",
+		              (json_int_t)line->losses, "error", error ? error : json_string("(not UTF-8)"), "counters",
+		              counters));
+	}
+	return list;
+}
+
+static json_t *clients_json(const struct control_status *s)
+{
+	json_t *list = json_array();
+
+	for (size_t i = 0; i < s->clients; i++) {
+		const struct control_client *c = &s->client[i];
+
+		json_array_append_new(list, json_pack("{s:I, s:s, s:s, s:I, s:I, s:I, s:I, s:I, s:I, s:I}", "id",
+		                                      (json_int_t)c->id, "kind", c->kind, "address", c->address, "step",
+		                                      (json_int_t)c->step, "behind", (json_int_t)c->behind,
+		                                      "behind_peak", (json_int_t)c->behind_peak, "bytes",
+		                                      (json_int_t)c->sent, "queued", (json_int_t)c->queued, "batches",
+		                                      (json_int_t)c->batches, "aborts", (json_int_t)c->aborts));
+	}
+	return list;
+}
+
+void control_put_status(struct buffer *b, const struct control_status *s)
+{
+	char map_id[33];
+	json_t *json = json_object();
+
+	for (int i = 0; i < 16; i++)
+		snprintf(map_id + 2 * i, 3, "%02x", s->map_id[i]);
+	json_object_update_new(json,
+	                       json_pack("{s:s, s:s, s:s, s:I, s:f, s:f, s:f, s:I, s:b}", "class", "STATUS", "version",
+	                                 FACET_VERSION, "map", map_id, "generation", (json_int_t)s->generation, "cell",
+	                                 s->cell_m, "t", (double)s->t_ns / 1e9, "uptime", (double)s->uptime_ns / 1e9,
+	                                 "step", (json_int_t)s->step, "paused", s->paused));
+	json_object_set_new(json, "rows", rows_json(s));
+	json_object_set_new(json, "map_size",
+	                    json_pack("{s:I, s:I, s:I, s:I}", "blocks", (json_int_t)s->grid.blocks, "patches",
+	                              (json_int_t)s->patches, "triangles_raw", (json_int_t)s->faces_raw, "triangles",
+	                              (json_int_t)s->faces));
+	json_object_set_new(json, "memory",
+	                    json_pack("{s:I, s:I, s:I, s:I, s:I, s:I, s:I}", "used", (json_int_t)s->grid.bytes, "cap",
+	                              (json_int_t)s->memory_cap, "refused_blocks", (json_int_t)s->grid.refused_memory,
+	                              "refused_far", (json_int_t)s->grid.refused_far, "encoded",
+	                              (json_int_t)s->encoded_bytes, "pinned", (json_int_t)s->pinned_bytes, "rss",
+	                              (json_int_t)s->rss_bytes));
+	json_object_set_new(json, "queue",
+	                    json_pack("{s:I, s:I, s:i}", "length", (json_int_t)s->worker.queued, "peak",
+	                              (json_int_t)s->worker.queued_peak, "cap", WORKER_ROWS_MAX));
+	json_object_set_new(json, "latency_ms",
+	                    json_pack("{s:f, s:f, s:I}", "p50", s->latency_p50_ms, "p99", s->latency_p99_ms, "n",
+	                              (json_int_t)s->latencies));
+	json_object_set_new(json, "devices", devices_json(s));
+	json_object_set_new(json, "clients", clients_json(s));
+	put(b, json);
+}

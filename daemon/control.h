@@ -1,0 +1,73 @@
+/* JSON lines: what a client may ask and what it is told (interfaces, section 4; docs/protocol.md, section 3). Pure. */
+#ifndef FACET_DAEMON_CONTROL_H
+#define FACET_DAEMON_CONTROL_H
+
+#include "core/model.h"
+#include "core/native.h"
+#include "daemon/supervisor.h"
+#include "daemon/worker.h"
+
+#define CONTROL_LINE_MAX (64u << 10)
+
+enum control_word { CONTROL_STATUS, CONTROL_WATCH, CONTROL_PAUSE, CONTROL_RESUME, CONTROL_RESET };
+
+struct control_command {
+	enum control_word word;
+	bool enable; /* of WATCH */
+};
+
+/* Parses `?WORD`, `?WORD={...}` or `{"command": "WORD", ...}`, with or without a `;` at the end. 0, -ENOTSUP where the
+ * word is known but comes later, -EINVAL; then with one sentence. */
+int control_parse(const char *text, size_t len, struct control_command *ret, char error[200]);
+
+/* Commands that change something are for the unix socket only. */
+bool control_changes(enum control_word);
+const char *control_name(enum control_word);
+
+struct control_client {
+	uint64_t id;
+	const char *kind; /* native, lines */
+	char address[64];
+	uint64_t step, behind, behind_peak, sent, queued, batches, aborts;
+};
+
+/* Everything a status message says. */
+struct control_status {
+	uint8_t map_id[16];
+	uint32_t generation;
+	double cell_m;
+	int64_t t_ns, uptime_ns;
+	uint64_t step;
+	bool paused;
+	struct {
+		uint64_t assembled, applied, not_applied, queue_full, paused;
+		double rate; /* 1/s */
+		struct sweep_stats sweep;
+	} rows;
+	size_t patches, encoded_bytes, pinned_bytes;
+	uint64_t faces, faces_raw;
+	struct grid_stats grid;
+	uint64_t memory_cap;
+	size_t rss_bytes;
+	struct worker_status worker;
+	double latency_p50_ms, latency_p99_ms;
+	uint64_t latencies;
+	int devices;
+	struct {
+		const char *name, *driver;
+		struct supervisor_device line;
+		double rate; /* profiles, angles or poses a second */
+		struct decoder_counters counters;
+	} device[CONFIG_DEVICES_MAX];
+	size_t clients;
+	const struct control_client *client;
+};
+
+/* Each appends one JSON text without a newline. */
+void control_put_status(struct buffer *, const struct control_status *);
+void control_put_version(struct buffer *);
+void control_put_answer(struct buffer *, const struct control_command *);
+void control_put_error(struct buffer *, const char *sentence);
+void control_put_device_event(struct buffer *, const char *device, const char *state, const char *text);
+
+#endif

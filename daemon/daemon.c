@@ -1,0 +1,628 @@
+/* The loop.
+ *
+ *   device readable ─► supervisor ─► on_record: journal, pipeline ─► worker's queue
+ *   10 Hz ───────────► on_tick:      journal, pipeline
+ *   worker ready ────► on_results:   publisher, then every client that has room
+ *   second ──────────► on_second:    rates, the journal's disk
+ *   watchdog ────────► on_watchdog:  only while the worker works or is idle
+ *
+ * Log time is taken here and nowhere else: realtime at the start plus what the monotonic clock has counted since, so it
+ * never goes back and a corrected wall clock moves nothing. All records of one turn of a device carry one time.
+ *
+ * The end: devices are stopped (a second at most), then sockets and handles are closed and the loop runs dry; whatever
+ * hangs, LAST_MS after the signal everything is closed. */
+#include "daemon/daemon.h"
+
+#include <assert.h>
+#include <errno.h>
+#include <signal.h>
+#include <stdio.h>
+#include <stdlib.h>
+#include <string.h>
+#include <sys/random.h>
+#include <time.h>
+#include <unistd.h>
+#include <uv.h>
+
+#include "daemon/control.h"
+#include "daemon/journal.h"
+#include "daemon/log.h"
+#include "daemon/notify.h"
+#include "daemon/publisher.h"
+#include "daemon/server.h"
+#include "daemon/supervisor.h"
+#include "daemon/worker.h"
+
+#define TICK_MS       100
+#define LAST_MS       2000
+#define LATENCIES     1024 /* the newest, for the percentiles */
+#define RATE_SECONDS  4    /* rates are means over so long */
+#define CLIENTS_SHOWN 64
+
+/* A device's descriptor in the loop; freed by libuv's last call. */
+struct watcher {
+	uv_poll_t poll;
+	struct daemon *daemon;
+	int device;
+};
+
+struct daemon {
+	const struct config *config;
+	uv_loop_t loop;
+	int64_t clock_offset_ns, started_ns; /* realtime - monotonic at the start */
+	struct publisher *publisher;
+	struct worker *worker;
+	struct pipeline *pipeline;
+	struct supervisor *supervisor;
+	struct server *server;
+	struct journal *journal;
+	struct journal_sink keep; /* empty without a journal */
+	bool journal_failed;
+	struct watcher *watcher[CONFIG_DEVICES_MAX];
+
+	uv_async_t results;
+	uv_timer_t devices, tick, second, watchdog, last;
+	uv_signal_t interrupt, terminate;
+	bool stopping, closed;
+	int failure; /* what ended it, if not a signal */
+	char *error;
+
+	/* For the status. */
+	bool paused;
+	uint64_t queue_full, rows_paused;
+	uint8_t map_id[16];
+	double latency_ms[LATENCIES];
+	uint64_t latencies;
+	struct grid_stats grid;
+	struct field_stats field;
+	uint64_t decoded[RATE_SECONDS + 1][CONFIG_DEVICES_MAX], rows[RATE_SECONDS + 1]; /* rings, a column a second */
+	uint64_t seconds;
+};
+
+static int64_t clock_ns(clockid_t clock)
+{
+	struct timespec ts;
+
+	clock_gettime(clock, &ts);
+	return (int64_t)ts.tv_sec * 1000000000 + ts.tv_nsec;
+}
+
+static int64_t now(void *ctx)
+{
+	const struct daemon *d = ctx;
+
+	return clock_ns(CLOCK_MONOTONIC) + d->clock_offset_ns;
+}
+
+static void stop(struct daemon *d);
+static void close_all(struct daemon *d);
+
+/* Ends the daemon with a sentence. */
+static void fail(struct daemon *d, int r, const char *sentence)
+{
+	if (d->failure == 0) {
+		d->failure = r;
+		snprintf(d->error, 320, "%s", sentence);
+	}
+	stop(d);
+}
+
+/* Devices */
+
+static void set_device_timer(struct daemon *d);
+
+static void on_device(uv_poll_t *poll, int status, int events)
+{
+	struct watcher *watcher = poll->data;
+	struct daemon *d = watcher->daemon;
+
+	/* An error on the descriptor is found by reading it, and told by the driver. */
+	supervisor_ready(d->supervisor, watcher->device, status < 0 || (events & UV_READABLE), events & UV_WRITABLE,
+	                 now(d));
+	if (status < 0 && d->watcher[watcher->device] == watcher)
+		uv_poll_start(&watcher->poll, UV_READABLE, on_device);
+	set_device_timer(d);
+}
+
+static void on_watcher_closed(uv_handle_t *handle)
+{
+	free(handle->data);
+}
+
+static void unwatch(struct daemon *d, int device)
+{
+	struct watcher *watcher = d->watcher[device];
+
+	if (!watcher)
+		return;
+	d->watcher[device] = NULL;
+	uv_poll_stop(&watcher->poll);
+	uv_close((uv_handle_t *)&watcher->poll, on_watcher_closed);
+}
+
+static struct watcher *make_watcher(struct daemon *d, int device, int fd)
+{
+	struct watcher *watcher = calloc(1, sizeof(*watcher));
+
+	if (!watcher || uv_poll_init(&d->loop, &watcher->poll, fd) < 0) {
+		log_line(LOG_ERR, "%s: its descriptor cannot be polled; is it a device?",
+		         d->config->device[device].name);
+		free(watcher);
+		return NULL;
+	}
+	watcher->poll.data = watcher;
+	watcher->daemon = d;
+	watcher->device = device;
+	return watcher;
+}
+
+static void watch_device(void *ctx, int device, int fd, bool writable)
+{
+	struct daemon *d = ctx;
+
+	if (fd < 0) {
+		unwatch(d, device);
+		return;
+	}
+	if (!d->watcher[device])
+		d->watcher[device] = make_watcher(d, device, fd);
+	if (d->watcher[device])
+		uv_poll_start(&d->watcher[device]->poll, UV_READABLE | (writable ? UV_WRITABLE : 0), on_device);
+}
+
+static void on_record(void *ctx, const struct record *record)
+{
+	struct daemon *d = ctx;
+
+	if (d->keep.record)
+		d->keep.record(d->keep.ctx, record);
+	pipeline_handle(d->pipeline, record);
+}
+
+/* A transition, with what the decoder has counted so far. */
+static void log_device(void *ctx, int device, int priority, const char *text)
+{
+	struct daemon *d = ctx;
+	const struct supervisor_device *line = supervisor_device(d->supervisor, device);
+	struct decoder_counters counters;
+	struct buffer message = {0};
+	char counted[300] = "";
+
+	pipeline_counters(d->pipeline, device, &counters);
+	for (int i = 0; i < counters.n; i++)
+		if (counters.counter[i].count > 0 && strlen(counted) < 200)
+			snprintf(counted + strlen(counted), sizeof(counted) - strlen(counted), "%s%s %llu",
+			         counted[0] ? ", " : " (", counters.counter[i].name,
+			         (unsigned long long)counters.counter[i].count);
+	log_line(priority, "%s: %s%s%s", d->config->device[device].name, text, counted, counted[0] ? ")" : "");
+	if (!d->server)
+		return;
+	control_put_device_event(&message, d->config->device[device].name, supervisor_state_name(line->state), text);
+	server_event(d->server, (const char *)message.data, message.len);
+	buffer_finish(&message);
+}
+
+static void on_devices(uv_timer_t *timer)
+{
+	struct daemon *d = timer->data;
+
+	supervisor_timer(d->supervisor, now(d));
+	set_device_timer(d);
+}
+
+/* One timer for the nearest deadline of all devices. */
+static void set_device_timer(struct daemon *d)
+{
+	int64_t deadline_ns = supervisor_deadline(d->supervisor), wait_ns = deadline_ns - now(d);
+
+	if (d->closed)
+		return;
+	if (d->stopping && supervisor_stopped(d->supervisor))
+		close_all(d);
+	else if (deadline_ns == INT64_MAX)
+		uv_timer_stop(&d->devices);
+	else /* rounded up: a timer that fires early finds nothing to do */
+		uv_timer_start(&d->devices, on_devices, wait_ns <= 0 ? 0 : (uint64_t)(wait_ns + 999999) / 1000000, 0);
+}
+
+/* The pipeline's sink */
+
+static bool take_row(void *ctx, struct row *row)
+{
+	struct daemon *d = ctx;
+	bool taken = !d->paused && worker_row(d->worker, row, pipeline_arrival_ns(d->pipeline));
+
+	d->rows_paused += d->paused;
+	d->queue_full += !d->paused && !taken;
+	return taken;
+}
+
+static void on_not_applied(void *ctx, uint64_t number, const char *reason)
+{
+	struct daemon *d = ctx;
+
+	(void)reason; /* counted by those who know it: the assembler, take_row */
+	if (d->keep.not_applied)
+		d->keep.not_applied(d->keep.ctx, number);
+}
+
+static void on_flush(void *ctx)
+{
+	worker_flush(((struct daemon *)ctx)->worker);
+}
+
+static void on_reply(void *ctx, int device, const struct reply *reply)
+{
+	supervisor_reply(((struct daemon *)ctx)->supervisor, device, reply);
+}
+
+static void on_data(void *ctx, int device, int64_t t_ns)
+{
+	supervisor_data(((struct daemon *)ctx)->supervisor, device, t_ns);
+}
+
+static void on_tick(uv_timer_t *timer)
+{
+	struct daemon *d = timer->data;
+	int64_t t_ns = now(d);
+
+	if (d->keep.tick)
+		d->keep.tick(d->keep.ctx, t_ns);
+	pipeline_tick(d->pipeline, t_ns);
+}
+
+/* Results of the worker */
+
+static void on_worker_ready(void *ctx) /* the worker's thread */
+{
+	uv_async_send(ctx);
+}
+
+static void note_latencies(struct daemon *d, const struct worker_result *result)
+{
+	int64_t t_ns = now(d);
+
+	for (size_t i = 0; i < result->arrivals; i++)
+		d->latency_ms[d->latencies++ % LATENCIES] = (double)(t_ns - result->arrival_ns[i]) / 1e6;
+}
+
+static int publish(struct daemon *d, const struct worker_result *result)
+{
+	if (result->reset)
+		publisher_reset(d->publisher);
+	d->grid = result->grid;
+	d->field = result->field;
+	return publisher_publish(d->publisher, result->step, result->patch, result->faces_raw, result->patches);
+}
+
+static void on_results(uv_async_t *async)
+{
+	struct daemon *d = async->data;
+	struct worker_status status;
+	struct worker_result *result;
+	int r = 0;
+
+	worker_status(d->worker, &status);
+	while (r == 0 && (result = worker_take(d->worker)) != NULL) {
+		r = publish(d, result);
+		server_wake(d->server);
+		note_latencies(d, result);
+		worker_result_destroy(result);
+	}
+	if (r < 0 || status.failed)
+		fail(d, -ENOMEM, "out of memory; give the machine more, or set a smaller map.memory");
+}
+
+/* Status and commands */
+
+static int compare_doubles(const void *a, const void *b)
+{
+	double x = *(const double *)a, y = *(const double *)b;
+
+	return x < y ? -1 : x > y;
+}
+
+static void fill_latency(const struct daemon *d, struct control_status *s)
+{
+	double sorted[LATENCIES];
+	size_t n = d->latencies < LATENCIES ? (size_t)d->latencies : LATENCIES;
+
+	s->latencies = d->latencies;
+	if (n == 0)
+		return;
+	memcpy(sorted, d->latency_ms, n * sizeof(*sorted));
+	qsort(sorted, n, sizeof(*sorted), compare_doubles);
+	s->latency_p50_ms = sorted[n / 2];
+	s->latency_p99_ms = sorted[n * 99 / 100];
+}
+
+static double rate(uint64_t newest, uint64_t oldest, uint64_t seconds)
+{
+	return seconds > 0 ? (double)(newest - oldest) / (double)seconds : 0;
+}
+
+static void fill_devices(const struct daemon *d, struct control_status *s)
+{
+	uint64_t span = d->seconds < RATE_SECONDS ? d->seconds : RATE_SECONDS;
+	size_t last = d->seconds % (RATE_SECONDS + 1), first = (d->seconds - span) % (RATE_SECONDS + 1);
+
+	s->devices = d->config->devices;
+	for (int i = 0; i < s->devices; i++) {
+		s->device[i].name = d->config->device[i].name;
+		s->device[i].driver = d->config->device[i].driver;
+		s->device[i].line = *supervisor_device(d->supervisor, i);
+		s->device[i].rate = rate(d->decoded[last][i], d->decoded[first][i], span);
+		pipeline_counters(d->pipeline, i, &s->device[i].counters);
+	}
+	s->rows.rate = rate(d->rows[last], d->rows[first], span);
+}
+
+static size_t resident_bytes(void)
+{
+	FILE *file = fopen("/proc/self/statm", "re");
+	unsigned long size = 0, resident = 0;
+
+	if (file && fscanf(file, "%lu %lu", &size, &resident) != 2)
+		resident = 0;
+	if (file)
+		fclose(file);
+	return resident * (size_t)sysconf(_SC_PAGESIZE);
+}
+
+static void put_status(void *ctx, struct buffer *ret)
+{
+	struct daemon *d = ctx;
+	struct control_client client[CLIENTS_SHOWN];
+	struct control_status s = {.client = client};
+	struct pipeline_stats rows;
+	struct publisher_stats map;
+
+	pipeline_stats(d->pipeline, &rows);
+	publisher_stats(d->publisher, &map);
+	worker_status(d->worker, &s.worker);
+	memcpy(s.map_id, d->map_id, sizeof(s.map_id));
+	s.generation = map.generation;
+	s.cell_m = d->config->map.cell_m;
+	s.t_ns = now(d);
+	s.uptime_ns = s.t_ns - d->started_ns;
+	s.step = map.step;
+	s.paused = d->paused;
+	s.rows.assembled = rows.rows;
+	s.rows.applied = d->field.step;
+	s.rows.not_applied = rows.not_applied;
+	s.rows.queue_full = d->queue_full;
+	s.rows.paused = d->rows_paused;
+	s.rows.sweep = rows.sweep;
+	s.patches = map.patches;
+	s.faces = map.faces;
+	s.faces_raw = map.faces_raw;
+	s.encoded_bytes = map.bytes;
+	s.pinned_bytes = map.pinned;
+	s.grid = d->grid;
+	s.memory_cap = d->config->map.memory;
+	s.rss_bytes = resident_bytes();
+	fill_latency(d, &s);
+	fill_devices(d, &s);
+	s.clients = server_clients(d->server, client, CLIENTS_SHOWN);
+	if (s.clients > CLIENTS_SHOWN)
+		s.clients = CLIENTS_SHOWN;
+	control_put_status(ret, &s);
+}
+
+static bool do_command(void *ctx, const struct control_command *command, char error[200])
+{
+	struct daemon *d = ctx;
+
+	(void)error;
+	log_line(LOG_INFO, "a client asks for %s", control_name(command->word));
+	if (command->word == CONTROL_RESET) {
+		if (d->keep.reset)
+			d->keep.reset(d->keep.ctx);
+		pipeline_reset(d->pipeline);
+		worker_reset(d->worker);
+	} else {
+		d->paused = command->word == CONTROL_PAUSE;
+	}
+	return true;
+}
+
+static void log_server(void *ctx, int priority, const char *text)
+{
+	(void)ctx;
+	log_line(priority, "%s", text);
+}
+
+/* Once a second */
+
+static void on_second(uv_timer_t *timer)
+{
+	struct daemon *d = timer->data;
+	struct pipeline_stats rows;
+	size_t column = ++d->seconds % (RATE_SECONDS + 1);
+
+	pipeline_stats(d->pipeline, &rows);
+	d->rows[column] = rows.rows;
+	for (int i = 0; i < d->config->devices; i++)
+		d->decoded[column][i] = supervisor_device(d->supervisor, i)->decoded;
+	if (d->journal && !d->journal_failed && journal_error(d->journal) < 0) {
+		d->journal_failed = true;
+		log_line(LOG_ERR, "the journal can no longer be written (%s); it ends here",
+		         strerror(-journal_error(d->journal)));
+	}
+}
+
+static void on_watchdog(uv_timer_t *timer)
+{
+	struct daemon *d = timer->data;
+
+	if (worker_alive(d->worker))
+		notify_alive();
+}
+
+/* Beginning and end */
+
+static void on_signal(uv_signal_t *handle, int number)
+{
+	struct daemon *d = handle->data;
+
+	if (d->stopping)
+		close_all(d); /* asked twice: at once */
+	else
+		log_line(LOG_INFO, "ends (%s)", number == SIGINT ? "interrupted" : "terminated");
+	stop(d);
+}
+
+static void on_last(uv_timer_t *timer)
+{
+	close_all(timer->data);
+}
+
+static void stop(struct daemon *d)
+{
+	if (d->stopping)
+		return;
+	d->stopping = true;
+	notify_stopping();
+	uv_timer_start(&d->last, on_last, LAST_MS, 0);
+	supervisor_stop(d->supervisor, now(d));
+	set_device_timer(d);
+}
+
+/* After this the loop runs dry. */
+static void close_all(struct daemon *d)
+{
+	uv_handle_t *handles[] = {(uv_handle_t *)&d->results,   (uv_handle_t *)&d->devices,  (uv_handle_t *)&d->tick,
+	                          (uv_handle_t *)&d->second,    (uv_handle_t *)&d->watchdog, (uv_handle_t *)&d->last,
+	                          (uv_handle_t *)&d->interrupt, (uv_handle_t *)&d->terminate};
+
+	if (d->closed)
+		return;
+	d->closed = true;
+	for (int i = 0; i < d->config->devices; i++)
+		unwatch(d, i);
+	if (d->server)
+		server_stop(d->server);
+	worker_destroy(d->worker); /* before the handle that its thread speaks to */
+	d->worker = NULL;
+	for (size_t i = 0; i < sizeof(handles) / sizeof(handles[0]); i++)
+		uv_close(handles[i], NULL);
+}
+
+static void begin_handles(struct daemon *d)
+{
+	uv_timer_t *timers[] = {&d->devices, &d->tick, &d->second, &d->watchdog, &d->last};
+	uint64_t watchdog_ms = notify_watchdog_ms();
+
+	uv_async_init(&d->loop, &d->results, on_results);
+	d->results.data = d;
+	for (size_t i = 0; i < sizeof(timers) / sizeof(timers[0]); i++) {
+		uv_timer_init(&d->loop, timers[i]);
+		timers[i]->data = d;
+	}
+	uv_signal_init(&d->loop, &d->interrupt);
+	uv_signal_init(&d->loop, &d->terminate);
+	d->interrupt.data = d->terminate.data = d;
+	uv_signal_start(&d->interrupt, on_signal, SIGINT);
+	uv_signal_start(&d->terminate, on_signal, SIGTERM);
+	uv_timer_start(&d->tick, on_tick, TICK_MS, TICK_MS);
+	uv_timer_start(&d->second, on_second, 1000, 1000);
+	if (watchdog_ms > 0)
+		uv_timer_start(&d->watchdog, on_watchdog, watchdog_ms, watchdog_ms);
+}
+
+static bool begin_parts(struct daemon *d)
+{
+	const struct config *config = d->config;
+	const struct driver *drivers[CONFIG_DEVICES_MAX];
+	struct publisher_params publisher = {.cell_m = config->map.cell_m};
+	struct worker_params worker = {.map = {.cell_m = config->map.cell_m,
+	                                       .tolerance = config->map.tolerance,
+	                                       .reduce = config->map.reduce,
+	                                       .lookahead = config->map.lookahead,
+	                                       .memory = config->map.memory},
+	                               .ready = on_worker_ready,
+	                               .ctx = &d->results};
+	struct pipeline_sink sink = {d, take_row, on_not_applied, on_flush, on_reply, on_data};
+	struct supervisor_host host = {d, watch_device, on_record, log_device};
+
+	memcpy(publisher.map_id, d->map_id, sizeof(publisher.map_id));
+	for (int i = 0; i < config->devices; i++)
+		drivers[i] = driver_find(config->device[i].driver);
+	d->publisher = publisher_create(&publisher);
+	d->worker = worker_create(&worker);
+	d->pipeline = pipeline_create(config, &sink);
+	d->supervisor = supervisor_create(config, drivers, &host);
+	return d->publisher && d->worker && d->pipeline && d->supervisor;
+}
+
+static int begin(struct daemon *d, const struct daemon_options *options)
+{
+	struct server_host host = {d, now, put_status, do_command, log_server};
+
+	if (options->journal) {
+		d->journal = journal_create(options->journal, d->error);
+		if (!d->journal)
+			return -EIO;
+		journal_sink(d->journal, &d->keep);
+	}
+	if (!begin_parts(d)) {
+		snprintf(d->error, 320, "out of memory; give the machine more, or set a smaller map.memory");
+		return -ENOMEM;
+	}
+	d->server = server_create(&d->loop, d->config, d->publisher, &host, d->error);
+	return d->server ? 0 : -EADDRINUSE;
+}
+
+static void finish(struct daemon *d)
+{
+	supervisor_destroy(d->supervisor);
+	server_destroy(d->server);
+	pipeline_destroy(d->pipeline);
+	publisher_destroy(d->publisher);
+	journal_destroy(d->journal);
+}
+
+static void announce(struct daemon *d)
+{
+	const char *address;
+
+	for (int i = 0; (address = server_address(d->server, i)) != NULL; i++)
+		log_line(LOG_INFO, "listens on %s", address);
+	notify_ready();
+}
+
+int daemon_run(const struct config *config, const struct daemon_options *options, char error[320])
+{
+	struct daemon *d = calloc(1, sizeof(*d));
+	int r;
+
+	if (!d || uv_loop_init(&d->loop) < 0) {
+		free(d);
+		snprintf(error, 320, "out of memory");
+		return -ENOMEM;
+	}
+	signal(SIGPIPE, SIG_IGN);
+	d->config = config;
+	d->error = error;
+	d->clock_offset_ns = clock_ns(CLOCK_REALTIME) - clock_ns(CLOCK_MONOTONIC);
+	d->started_ns = now(d);
+	if (getrandom(d->map_id, sizeof(d->map_id), GRND_NONBLOCK) < 0)
+		memcpy(d->map_id, &d->started_ns, sizeof(d->started_ns)); /* early at boot: the time will do */
+	begin_handles(d);
+	r = begin(d, options);
+	if (r == 0) {
+		supervisor_start(d->supervisor, now(d));
+		set_device_timer(d);
+		announce(d);
+		uv_run(&d->loop, UV_RUN_DEFAULT);
+		r = d->failure;
+	} else {
+		close_all(d);
+	}
+	/* Devices are closed with their supervisor, whose descriptors are then no longer polled. */
+	finish(d);
+	uv_run(&d->loop, UV_RUN_DEFAULT);
+	uv_loop_close(&d->loop);
+	free(d);
+	return r;
+}

@@ -1,0 +1,14 @@
+/* The daemon: one loop that owns devices, pipeline, clients and the worker's results. */
+#ifndef FACET_DAEMON_DAEMON_H
+#define FACET_DAEMON_DAEMON_H
+
+#include "config/config.h"
+
+struct daemon_options {
+	const char *journal; /* keep what the loop hands to the pipeline in this file; NULL: nowhere */
+};
+
+/* Runs until SIGINT or SIGTERM (orderly, within 3 s). 0, or -errno with one sentence. */
+int daemon_run(const struct config *, const struct daemon_options *, char error[320]);
+
+#endif

@@ -1,0 +1,168 @@
+/* Opening where clients connect.
+ *
+ * A unix socket's file survives the program that made it. Whether one that is there is alive is asked by connecting: who
+ * refuses is dead, and its file is removed; a file that is no socket never is. The umask is set around bind, because
+ * between bind and a chmod anybody could connect. */
+#include "daemon/listener.h"
+
+#include <errno.h>
+#include <grp.h>
+#include <netinet/in.h>
+#include <stdio.h>
+#include <string.h>
+#include <sys/socket.h>
+#include <sys/un.h>
+#include <unistd.h>
+
+#define BACKLOG 64
+
+static int refuse(const struct listener *l, int r, const char *why, char error[320])
+{
+	snprintf(error, 320, "%.120s: %s", l->name, why);
+	return r;
+}
+
+static const char *explain_bind(int r)
+{
+	switch (r) {
+	case -EADDRINUSE:
+		return "somebody listens there already; stop that program or set another listen.native";
+	case -ENOENT:
+	case -ENOTDIR:
+		return "the socket's directory does not exist; create it or set another listen.native";
+	case -EACCES:
+	case -EPERM:
+	case -EROFS:
+		return "may not be bound (no permission); let this user write the directory, or set another "
+		       "listen.native";
+	case -EADDRNOTAVAIL:
+		return "this machine has no such address; set another listen.native";
+	default:
+		return strerror(-r);
+	}
+}
+
+static bool answers(const struct sockaddr_un *address)
+{
+	int fd = socket(AF_UNIX, SOCK_STREAM | SOCK_CLOEXEC | SOCK_NONBLOCK, 0);
+	bool alive =
+	    fd < 0 || connect(fd, (const struct sockaddr *)address, sizeof(*address)) == 0 || errno != ECONNREFUSED;
+
+	if (fd >= 0)
+		close(fd);
+	return alive;
+}
+
+static int bind_unix(int fd, const struct sockaddr_un *address)
+{
+	mode_t before = umask(0117); /* 0660 */
+	int r = bind(fd, (const struct sockaddr *)address, sizeof(*address)) < 0 ? -errno : 0;
+	struct stat st;
+
+	if (r == -EADDRINUSE && lstat(address->sun_path, &st) == 0 && S_ISSOCK(st.st_mode) && !answers(address)) {
+		if (unlink(address->sun_path) < 0)
+			r = -errno;
+		else
+			r = bind(fd, (const struct sockaddr *)address, sizeof(*address)) < 0 ? -errno : 0;
+	}
+	umask(before);
+	return r;
+}
+
+static void give_to_group(const char *path, const char *name)
+{
+	struct group *group = name[0] ? getgrnam(name) : NULL;
+
+	if (group && lchown(path, (uid_t)-1, group->gr_gid) < 0)
+		return; /* not a member of it: the daemon's own stays, as documented */
+}
+
+static int open_unix(struct listener *l, const char *group, char error[320])
+{
+	struct sockaddr_un address = {.sun_family = AF_UNIX};
+	struct stat st;
+	int r;
+
+	_Static_assert(sizeof(l->address.path) <= sizeof(address.sun_path), "address_parse refuses what would be cut");
+	snprintf(address.sun_path, sizeof(address.sun_path), "%s", l->address.path);
+	l->local = true;
+	l->fd = socket(AF_UNIX, SOCK_STREAM | SOCK_NONBLOCK | SOCK_CLOEXEC, 0);
+	if (l->fd < 0)
+		return refuse(l, -errno, strerror(errno), error);
+	r = bind_unix(l->fd, &address);
+	if (r < 0)
+		return refuse(l, r, explain_bind(r), error);
+	give_to_group(l->address.path, group);
+	if (lstat(l->address.path, &st) == 0) {
+		l->dev = st.st_dev;
+		l->ino = st.st_ino;
+	}
+	return 0;
+}
+
+/* The port that port 0 became. */
+static void name_port(struct listener *l)
+{
+	struct sockaddr_storage bound = {0};
+	socklen_t len = sizeof(bound);
+
+	if (getsockname(l->fd, (struct sockaddr *)&bound, &len) < 0)
+		return;
+	if (bound.ss_family == AF_INET)
+		l->address.port = ntohs(((struct sockaddr_in *)&bound)->sin_port);
+	if (bound.ss_family == AF_INET6)
+		l->address.port = ntohs(((struct sockaddr_in6 *)&bound)->sin6_port);
+	address_print(&l->address, l->name);
+}
+
+static int open_tcp(struct listener *l, char error[320])
+{
+	struct sockaddr_storage address = {0};
+	char sentence[ADDRESS_ERROR_MAX];
+	socklen_t len = 0;
+	int on = 1;
+
+	if (address_check_loopback(&l->address, sentence) < 0 || address_sockaddr(&l->address, &address, &len) < 0)
+		return refuse(l, -EINVAL,
+		              "is not on loopback; use 127.0.0.1 here, and ssh -L to reach it from elsewhere", error);
+	l->fd = socket(address.ss_family, SOCK_STREAM | SOCK_NONBLOCK | SOCK_CLOEXEC, 0);
+	if (l->fd < 0)
+		return refuse(l, -errno, strerror(errno), error);
+	setsockopt(l->fd, SOL_SOCKET, SO_REUSEADDR, &on, sizeof(on));
+	if (bind(l->fd, (struct sockaddr *)&address, len) < 0)
+		return refuse(l, -errno, explain_bind(-errno), error);
+	name_port(l);
+	return 0;
+}
+
+int listener_open(struct listener *l, const char *text, const char *group, char error[320])
+{
+	char sentence[ADDRESS_ERROR_MAX];
+	int r;
+
+	memset(l, 0, sizeof(*l));
+	l->fd = -1;
+	snprintf(l->name, sizeof(l->name), "%s", text);
+	if (address_parse(text, ADDRESS_UNIX | ADDRESS_TCP, &l->address, sentence) < 0) {
+		snprintf(error, 320, "listen.native: %s", sentence);
+		return -EINVAL;
+	}
+	r = l->address.kind == ADDRESS_UNIX ? open_unix(l, group, error) : open_tcp(l, error);
+	if (r == 0 && listen(l->fd, BACKLOG) < 0)
+		r = refuse(l, -errno, explain_bind(-errno), error);
+	if (r < 0)
+		listener_close(l);
+	return r;
+}
+
+void listener_close(struct listener *l)
+{
+	struct stat st;
+
+	if (l->fd >= 0)
+		close(l->fd);
+	l->fd = -1;
+	if (l->ino && lstat(l->address.path, &st) == 0 && st.st_dev == l->dev && st.st_ino == l->ino)
+		unlink(l->address.path);
+	l->ino = 0;
+}

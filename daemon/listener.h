@@ -1,0 +1,24 @@
+/* Listening sockets, opened: stale unix sockets are replaced, live ones refused, TCP stays on loopback (decision D11). */
+#ifndef FACET_DAEMON_LISTENER_H
+#define FACET_DAEMON_LISTENER_H
+
+#include <stdbool.h>
+#include <sys/stat.h>
+
+#include "config/address.h"
+
+struct listener {
+	int fd;
+	bool local;                  /* a unix socket: its clients may change things */
+	char name[ADDRESS_TEXT_MAX]; /* as in the configuration, with the port it really has */
+	struct address address;
+	dev_t dev; /* of the socket's file: only our own is removed */
+	ino_t ino;
+};
+
+/* `group` of a unix socket; where it does not exist or may not be given, the daemon's own stays. 0, or -errno with one
+ * sentence that names the address and what to do. */
+int listener_open(struct listener *, const char *text, const char *group, char error[320]);
+void listener_close(struct listener *); /* removes a unix socket's file */
+
+#endif

@@ -27,6 +27,8 @@ static const char *explain_bind(int r)
 	switch (r) {
 	case -EADDRINUSE:
 		return "somebody listens there already; stop that program or set another listen.native";
+	case -ENOTSOCK:
+		return "a file that is no socket stands there; remove it or set another listen.native";
 	case -ENOENT:
 	case -ENOTDIR:
 		return "the socket's directory does not exist; create it or set another listen.native";
@@ -58,8 +60,11 @@ static int bind_unix(int fd, const struct sockaddr_un *address)
 	mode_t before = umask(0117); /* 0660 */
 	int r = bind(fd, (const struct sockaddr *)address, sizeof(*address)) < 0 ? -errno : 0;
 	struct stat st;
+	bool is_socket = r == -EADDRINUSE && lstat(address->sun_path, &st) == 0 && S_ISSOCK(st.st_mode);
 
-	if (r == -EADDRINUSE && lstat(address->sun_path, &st) == 0 && S_ISSOCK(st.st_mode) && !answers(address)) {
+	if (r == -EADDRINUSE && !is_socket) {
+		r = -ENOTSOCK;
+	} else if (is_socket && !answers(address)) {
 		if (unlink(address->sun_path) < 0)
 			r = -errno;
 		else

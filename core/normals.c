@@ -12,10 +12,10 @@
 
 #define REACH_M       0.10
 #define HALF_MAX      10    /* beams or lines */
-#define RESIDUAL_M    0.010 /* rms beyond which other windows are tried */
+#define RESIDUAL_M    0.015 /* rms beyond which other windows are tried */
 #define UNITS_M       8000.0
 #define LINE_RATIO    1e-6 /* least second eigenvalue of the greatest: below it the points lie on a line */
-#define TILT_VARIANCE 0.02 /* rad2: a normal less certain than this is none */
+#define TILT_VARIANCE 0.1  /* rad2: a normal less certain than this is none */
 
 struct fit {
 	struct vec3 normal; /* either way round */

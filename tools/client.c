@@ -273,6 +273,8 @@ static int take_frame(struct client *client, char error[CLIENT_ERROR_MAX])
 {
 	char sentence[128] = "the length of a frame is impossible";
 	struct native_message message;
+	if (client->begin == client->end)
+		return -EAGAIN;
 	const uint8_t *frame = client->data + client->begin;
 	const ssize_t n = native_scan(frame, client->end - client->begin, NATIVE_TO_CLIENT_MAX);
 	if (n == 0)

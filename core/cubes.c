@@ -24,17 +24,21 @@
 /* Bits of a row: corner i is bit i + WINDOW_LOW. */
 #define CORNERS_FILLED (((1u << (PATCH_SIDE + 3)) - 1) << (WINDOW_LOW - 1)) /* -1 .. 17 */
 #define CELLS_HALO     (((1u << (PATCH_SIDE + 2)) - 1) << (WINDOW_LOW - 1)) /* -1 .. 16 */
-#define CELLS_OWN      (((1u << PATCH_SIDE) - 1) << WINDOW_LOW)             /* 0 .. 15 */
 
-static_assert(sizeof(struct voxel) == 8, "a voxel is read as one word, its published value in the upper quarter");
 static_assert(__BYTE_ORDER__ == __ORDER_LITTLE_ENDIAN__, "four values are judged in one little-endian word");
 
-/* Known and inside bits of the rows of a window, before and after the fill. */
+/* Rows are judged four at a time. */
+typedef uint32_t rows4 __attribute__((vector_size(16)));
+#define ROWS_PADDED (ROWS + 4)
+
+/* Known and inside bits of the rows of a window, before and after the fill. Rows of corners outside -1 .. 17 hold
+ * nothing of meaning in the last five. */
 struct rows {
-	uint32_t known[ROWS], inside[ROWS];
-	uint32_t filled[ROWS]; /* corners the fill makes known */
-	uint32_t needed[ROWS]; /* corners of cells with a surface */
-	uint32_t known_after[ROWS], inside_after[ROWS];
+	uint32_t known[ROWS_PADDED], inside[ROWS_PADDED];
+	uint32_t filled[ROWS_PADDED]; /* corners the fill makes known */
+	uint32_t known_after[ROWS_PADDED], inside_after[ROWS_PADDED];
+	uint32_t active[ROWS_PADDED]; /* cells with a surface */
+	uint32_t needed[ROWS_PADDED]; /* corners of cells with a surface */
 };
 
 static int row_at(int j, int k)
@@ -42,18 +46,11 @@ static int row_at(int j, int k)
 	return (k + WINDOW_LOW) * WINDOW_SIDE + j + WINDOW_LOW;
 }
 
-static uint64_t load64(const void *from)
-{
-	uint64_t word;
-	memcpy(&word, from, sizeof word);
-	return word;
-}
-
 /* The published values of four voxels in one word. */
-static uint64_t pack4(const struct voxel *v)
+static inline uint64_t pack4(const struct voxel *v)
 {
-	const uint64_t top = 0xffffull << 48;
-	return load64(&v[0]) >> 48 | (load64(&v[1]) & top) >> 32 | (load64(&v[2]) & top) >> 16 | (load64(&v[3]) & top);
+	return (uint64_t)(uint16_t)v[0].published | (uint64_t)(uint16_t)v[1].published << 16 |
+	       (uint64_t)(uint16_t)v[2].published << 32 | (uint64_t)(uint16_t)v[3].published << 48;
 }
 
 /* The upper bits of the eight quarters of two words, as bits 0 .. 7. The factor moves bit 16 m (and 16 m + 4, which the
@@ -71,30 +68,6 @@ static inline uint64_t not_zero(uint64_t word)
 	return ((word & low) + low) | word;
 }
 
-/* `n` values from `value` on: bit b of the results belongs to value b. */
-static inline void judge_row(const int16_t *value, int n, uint32_t *ret_known, uint32_t *ret_inside)
-{
-	const uint64_t unknown = 0x8000800080008000ull;
-	uint32_t known = 0, negative = 0;
-	int b = 0;
-	for (; b + 8 <= n; b += 8) {
-		uint64_t low = load64(value + b), high = load64(value + b + 4);
-		known |= top_bits(not_zero(low ^ unknown), not_zero(high ^ unknown)) << b;
-		negative |= top_bits(low, high) << b;
-	}
-	for (; b + 4 <= n; b += 4) {
-		uint64_t low = load64(value + b);
-		known |= top_bits(not_zero(low ^ unknown), 0) << b;
-		negative |= top_bits(low, 0) << b;
-	}
-	for (; b < n; b++) {
-		known |= (uint32_t)(value[b] != VOXEL_UNKNOWN) << b;
-		negative |= (uint32_t)(value[b] < 0) << b;
-	}
-	*ret_known = known;
-	*ret_inside = negative & known;
-}
-
 /* How the layers of block `b` (-1 .. 2 from the patch's own first) lie in the window along one axis. */
 static void block_layers(int b, int *ret_first, int *ret_count, int *ret_place)
 {
@@ -103,7 +76,27 @@ static void block_layers(int b, int *ret_first, int *ret_count, int *ret_place)
 	*ret_place = b < 0 ? 0 : WINDOW_LOW + b * BLOCK_SIDE;
 }
 
-static void copy_block(const struct block *block, const int at[3], int16_t *value)
+/* Eight voxels to eight values and their bits. */
+static inline void copy_eight(const struct voxel *from, int16_t *to, uint32_t *ret_known, uint32_t *ret_inside)
+{
+	const uint64_t unknown = 0x8000800080008000ull;
+	uint64_t words[2] = {pack4(from), pack4(from + 4)};
+	memcpy(to, words, sizeof words);
+	*ret_known = top_bits(not_zero(words[0] ^ unknown), not_zero(words[1] ^ unknown));
+	*ret_inside = top_bits(words[0], words[1]) & *ret_known;
+}
+
+static inline void copy_few(const struct voxel *from, int n, int16_t *to, uint32_t *ret_known, uint32_t *ret_inside)
+{
+	*ret_known = *ret_inside = 0;
+	for (int x = 0; x < n; x++) {
+		int16_t value = to[x] = from[x].published;
+		*ret_known |= (uint32_t)(value != VOXEL_UNKNOWN) << x;
+		*ret_inside |= (uint32_t)(value != VOXEL_UNKNOWN && value < 0) << x;
+	}
+}
+
+static void copy_block(const struct block *block, const int at[3], int16_t *value, struct rows *rows)
 {
 	int first[3], count[3], place[3];
 	for (int axis = 0; axis < 3; axis++)
@@ -112,14 +105,15 @@ static void copy_block(const struct block *block, const int at[3], int16_t *valu
 		for (int y = 0; y < count[1]; y++) {
 			const struct voxel *from =
 			    &block->voxel[((z + first[2]) * BLOCK_SIDE + y + first[1]) * BLOCK_SIDE + first[0]];
-			int16_t *to = &value[((z + place[2]) * WINDOW_SIDE + y + place[1]) * WINDOW_SIDE + place[0]];
-			if (count[0] == BLOCK_SIDE) {
-				uint64_t words[2] = {pack4(from), pack4(from + 4)};
-				memcpy(to, words, sizeof words);
-			} else {
-				for (int x = 0; x < count[0]; x++)
-					to[x] = from[x].published;
-			}
+			int row = (z + place[2]) * WINDOW_SIDE + y + place[1];
+			int16_t *to = &value[row * WINDOW_SIDE + place[0]];
+			uint32_t known, inside;
+			if (count[0] == BLOCK_SIDE)
+				copy_eight(from, to, &known, &inside);
+			else
+				copy_few(from, count[0], to, &known, &inside);
+			rows->known[row] |= known << place[0];
+			rows->inside[row] |= inside << place[0];
 		}
 }
 
@@ -173,7 +167,7 @@ static bool may_have_cells(int axes)
 }
 
 /* False where no cell of the patch can be complete; then nothing was copied. */
-static bool copy_blocks(const struct grid *grid, struct patch_key key, int16_t *value)
+static bool copy_blocks(const struct grid *grid, struct patch_key key, int16_t *value, struct rows *rows)
 {
 	const struct block *blocks[BLOCKS_A_SIDE * BLOCKS_A_SIDE * BLOCKS_A_SIDE];
 	int axes = 0, at[3];
@@ -182,84 +176,106 @@ static bool copy_blocks(const struct grid *grid, struct patch_key key, int16_t *
 		return false;
 	find_blocks(grid, key, true, blocks, &axes);
 	forget_values(value);
+	memset(rows->known, 0, sizeof rows->known);
+	memset(rows->inside, 0, sizeof rows->inside);
 	for (at[2] = -1; at[2] < 3; at[2]++)
 		for (at[1] = -1; at[1] < 3; at[1]++)
 			for (at[0] = -1; at[0] < 3; at[0]++) {
 				const struct block *block = blocks[block_at(at[0] + 1, at[1] + 1, at[2] + 1)];
 				if (block)
-					copy_block(block, at, value);
+					copy_block(block, at, value, rows);
 			}
 	return true;
 }
 
 /* Whether both signs occur. */
-static bool judge_window(const int16_t *value, struct rows *rows)
+static bool both_signs(const struct rows *rows)
 {
 	uint32_t inside = 0, outside = 0;
 	for (int r = 0; r < ROWS; r++) {
-		judge_row(value + r * WINDOW_SIDE, WINDOW_SIDE, &rows->known[r], &rows->inside[r]);
 		inside |= rows->inside[r];
 		outside |= rows->known[r] & ~rows->inside[r];
 	}
 	return inside && outside;
 }
 
-/* The corners of one row that the fill makes known, and which of them inside. */
-static void fill_row(const uint32_t *known, const uint32_t *inside, uint32_t *ret_filled, uint32_t *ret_inside)
+static inline rows4 load_rows(const uint32_t *row)
+{
+	rows4 rows;
+	memcpy(&rows, row, sizeof rows);
+	return rows;
+}
+
+static inline void store_rows(uint32_t *row, rows4 rows)
+{
+	memcpy(row, &rows, sizeof rows);
+}
+
+/* The corners that the fill makes known in four rows from `r` on, and all that are known and inside then. */
+static inline void fill_rows(struct rows *rows, int r)
 {
 	const int y = 1, z = WINDOW_SIDE;
-	uint32_t along[3] = {known[0] << 1 | known[0] >> 1, known[-y] | known[y], known[-z] | known[z]};
-	uint32_t two = (along[0] & along[1]) | (along[0] & along[2]) | (along[1] & along[2]);
-	uint32_t candidates = two & ~known[0] & CORNERS_FILLED;
-	*ret_filled = *ret_inside = 0;
-	if (!candidates)
-		return;
-	uint32_t own = known[0] & ~inside[0];
-	uint32_t negative = inside[0] << 1 | inside[0] >> 1 | inside[-y] | inside[y] | inside[-z] | inside[z];
-	uint32_t positive = own << 1 | own >> 1 | (known[-y] & ~inside[-y]) | (known[y] & ~inside[y]) |
-	                    (known[-z] & ~inside[-z]) | (known[z] & ~inside[z]);
-	*ret_filled = candidates & (negative ^ positive);
-	*ret_inside = *ret_filled & negative;
+	const uint32_t *known = &rows->known[r], *inside = &rows->inside[r];
+	rows4 own = load_rows(known), own_in = load_rows(inside), own_out = own & ~own_in;
+	rows4 near_y[2] = {load_rows(known - y), load_rows(known + y)};
+	rows4 near_z[2] = {load_rows(known - z), load_rows(known + z)};
+	rows4 in_y[2] = {load_rows(inside - y), load_rows(inside + y)};
+	rows4 in_z[2] = {load_rows(inside - z), load_rows(inside + z)};
+	rows4 along_x = own << 1 | own >> 1, along_y = near_y[0] | near_y[1], along_z = near_z[0] | near_z[1];
+	rows4 two = (along_x & along_y) | (along_x & along_z) | (along_y & along_z);
+	rows4 negative = own_in << 1 | own_in >> 1 | in_y[0] | in_y[1] | in_z[0] | in_z[1];
+	rows4 positive = own_out << 1 | own_out >> 1 | (near_y[0] & ~in_y[0]) | (near_y[1] & ~in_y[1]) |
+	                 (near_z[0] & ~in_z[0]) | (near_z[1] & ~in_z[1]);
+	rows4 filled = two & ~own & CORNERS_FILLED & (negative ^ positive);
+	store_rows(&rows->filled[r], filled);
+	store_rows(&rows->known_after[r], own | filled);
+	store_rows(&rows->inside_after[r], own_in | (filled & negative));
 }
 
-/* Cells of a row with a surface: complete, of both signs. The rows are those of the corners after the fill. */
-static inline uint32_t active_cells(const uint32_t *known, const uint32_t *inside, int y, int z)
+/* Cells with a surface (complete, of both signs) in four rows from `r` on. */
+static inline void find_active(struct rows *rows, int r)
 {
-	uint32_t all = known[0] & known[y] & known[z] & known[y + z];
-	uint32_t any = inside[0] | inside[y] | inside[z] | inside[y + z];
-	uint32_t every = inside[0] & inside[y] & inside[z] & inside[y + z];
-	return all & all >> 1 & (any | any >> 1) & ~(every & every >> 1);
+	const uint32_t *known = &rows->known_after[r], *inside = &rows->inside_after[r];
+	const int y = 1, z = WINDOW_SIDE;
+	rows4 all = load_rows(known) & load_rows(known + y) & load_rows(known + z) & load_rows(known + y + z);
+	rows4 in[4] = {load_rows(inside), load_rows(inside + y), load_rows(inside + z), load_rows(inside + y + z)};
+	rows4 any = in[0] | in[1] | in[2] | in[3], every = in[0] & in[1] & in[2] & in[3];
+	store_rows(&rows->active[r], all & all >> 1 & (any | any >> 1) & ~(every & every >> 1) & CELLS_HALO);
 }
 
-/* Finds the filled corners and those that cells with a surface need; true when a cell of the patch itself has one. */
-static bool find_filled(struct rows *rows)
+/* Finds the filled corners, the cells with a surface and the corners these need. */
+static void find_cells(struct rows *rows)
 {
-	bool own = false;
-	for (int k = -1; k <= PATCH_SIDE + 1; k++)
-		for (int j = -1; j <= PATCH_SIDE + 1; j++) {
-			int r = row_at(j, k);
-			uint32_t inside;
-			fill_row(&rows->known[r], &rows->inside[r], &rows->filled[r], &inside);
-			rows->known_after[r] = rows->known[r] | rows->filled[r];
-			rows->inside_after[r] = rows->inside[r] | inside;
-			rows->needed[r] = 0;
-		}
+	for (int r = row_at(-1, -1); r <= row_at(PATCH_SIDE + 1, PATCH_SIDE + 1); r += 4)
+		fill_rows(rows, r);
+	for (int r = row_at(-1, -1); r <= row_at(PATCH_SIDE, PATCH_SIDE); r += 4)
+		find_active(rows, r);
+	memset(rows->needed, 0, sizeof rows->needed);
 	for (int k = -1; k <= PATCH_SIDE; k++)
 		for (int j = -1; j <= PATCH_SIDE; j++) {
 			int r = row_at(j, k);
-			uint32_t active =
-			    CELLS_HALO & active_cells(&rows->known_after[r], &rows->inside_after[r], 1, WINDOW_SIDE);
-			if (!active)
+			uint32_t corners = rows->active[r] | rows->active[r] << 1;
+			if (!corners)
 				continue;
-			uint32_t corners = active | active << 1;
 			rows->needed[r] |= corners;
 			rows->needed[r + 1] |= corners;
 			rows->needed[r + WINDOW_SIDE] |= corners;
 			rows->needed[r + WINDOW_SIDE + 1] |= corners;
-			if ((active & CELLS_OWN) && j >= 0 && k >= 0 && j < PATCH_SIDE && k < PATCH_SIDE)
-				own = true;
 		}
-	return own;
+}
+
+/* Hands the patch's own cells with a surface, and the corners around them, to the extraction; false where there are none. */
+static bool keep_cells(const struct rows *rows, struct window *window)
+{
+	uint32_t any = 0;
+	for (int k = 0; k < PATCH_SIDE; k++)
+		for (int j = 0; j < PATCH_SIDE; j++) {
+			uint32_t own = rows->active[row_at(j, k)] >> WINDOW_LOW & ((1u << PATCH_SIDE) - 1);
+			window->active[k * PATCH_SIDE + j] = (uint16_t)own;
+			any |= own;
+		}
+	memcpy(window->inside, rows->inside_after, sizeof window->inside);
+	return any;
 }
 
 /* The known neighbour of largest magnitude; all have one sign, so equal magnitudes are equal values. */
@@ -295,13 +311,15 @@ void cubes_gather(const struct grid *grid, struct patch_key key, struct window *
 	assert(grid && ret);
 	ret->key = key;
 	ret->empty = true;
-	if (!copy_blocks(grid, key, ret->value))
-		return;
 	struct rows rows;
-	if (!judge_window(ret->value, &rows))
+	if (!copy_blocks(grid, key, ret->value, &rows))
 		return;
-	ret->empty = !find_filled(&rows);
-	fill_values(&rows, ret->value);
+	if (!both_signs(&rows))
+		return;
+	find_cells(&rows);
+	ret->empty = !keep_cells(&rows, ret);
+	if (!ret->empty)
+		fill_values(&rows, ret->value);
 }
 
 bool window_cell_complete(const struct window *window, int i, int j, int k)
@@ -313,7 +331,7 @@ bool window_cell_complete(const struct window *window, int i, int j, int k)
 	       high[WINDOW_SIDE] != VOXEL_UNKNOWN && high[WINDOW_SIDE + 1] != VOXEL_UNKNOWN;
 }
 
-/* Extraction. Rows of corners 0 .. 16 of the patch, bit i for corner i. */
+/* Extraction. */
 #define CORNERS      (PATCH_SIDE + 1)
 #define VERTEX_NAMES (CORNERS * CORNERS * CORNERS * 3)
 
@@ -330,14 +348,6 @@ struct extraction {
 	uint16_t *index; /* [VERTEX_NAMES] vertex of a name + 1, or 0: none so far */
 };
 
-static void sign_rows(const struct window *window, uint32_t *ret_known, uint32_t *ret_inside)
-{
-	for (int k = 0; k < CORNERS; k++)
-		for (int j = 0; j < CORNERS; j++)
-			judge_row(&window->value[window_at(0, j, k)], CORNERS, &ret_known[k * CORNERS + j],
-			          &ret_inside[k * CORNERS + j]);
-}
-
 static uint8_t case_triangles(uint8_t code)
 {
 	uint8_t n = 0;
@@ -347,17 +357,16 @@ static uint8_t case_triangles(uint8_t code)
 }
 
 /* Lists the cells with a surface in canonical order (z, then y, then x). */
-static void list_cells(struct extraction *x, const uint32_t *known, const uint32_t *inside)
+static void list_cells(struct extraction *x)
 {
 	for (int k = 0; k < PATCH_SIDE; k++)
 		for (int j = 0; j < PATCH_SIDE; j++) {
-			const uint32_t *in = &inside[k * CORNERS + j];
-			uint32_t active =
-			    active_cells(&known[k * CORNERS + j], in, 1, CORNERS) & ((1u << PATCH_SIDE) - 1);
-			for (; active; active &= active - 1) {
-				int i = __builtin_ctz(active);
-				uint8_t code = (uint8_t)((in[0] >> i & 3) | (in[1] >> i & 3) << 2 |
-				                         (in[CORNERS] >> i & 3) << 4 | (in[CORNERS + 1] >> i & 3) << 6);
+			const uint32_t *in = &x->window->inside[row_at(j, k)];
+			const uint32_t rows[4] = {in[0], in[1], in[WINDOW_SIDE], in[WINDOW_SIDE + 1]};
+			for (uint32_t active = x->window->active[k * PATCH_SIDE + j]; active; active &= active - 1) {
+				int i = __builtin_ctz(active), b = i + WINDOW_LOW;
+				uint8_t code = (uint8_t)((rows[0] >> b & 3) | (rows[1] >> b & 3) << 2 |
+				                         (rows[2] >> b & 3) << 4 | (rows[3] >> b & 3) << 6);
 				x->cell[x->cells++] = (struct active_cell){(uint8_t)i, (uint8_t)j, (uint8_t)k, code};
 				x->triangles += case_triangles(code);
 			}
@@ -415,12 +424,10 @@ int cubes_extract(const struct window *window, struct arena *arena, struct surfa
 	struct extraction x = {.window = window};
 	struct surface surface = {0};
 	if (!window->empty) {
-		uint32_t known[CORNERS * CORNERS], inside[CORNERS * CORNERS];
-		sign_rows(window, known, inside);
 		x.cell = ARENA_NEW(arena, struct active_cell, PATCH_SIDE * PATCH_SIDE * PATCH_SIDE);
 		if (!x.cell)
 			return -ENOMEM;
-		list_cells(&x, known, inside);
+		list_cells(&x);
 	}
 	if (x.cells) {
 		int r = reserve(&x, arena, &surface);

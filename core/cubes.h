@@ -22,6 +22,10 @@ struct window {
 	struct patch_key key;
 	bool empty; /* no cell of the patch has a surface: nothing to extract, and the values mean nothing */
 	int16_t value[WINDOW_VOXELS]; /* 1/256 cell, VOXEL_UNKNOWN */
+	/* For cubes_extract: the patch's cells with a surface, bit i of row k * 16 + j; the inside corners after the fill, bit
+	 * i + 2 of row (k + 2) * 21 + j + 2. */
+	uint16_t active[PATCH_SIDE * PATCH_SIDE];
+	uint32_t inside[WINDOW_SIDE * WINDOW_SIDE];
 };
 
 static inline int window_at(int i, int j, int k) /* patch coordinates, -2 .. 18 */

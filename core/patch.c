@@ -340,22 +340,12 @@ size_t patch_store_living(const struct patch_store *store, struct patch ***ret_p
 	return n;
 }
 
+static_assert(__BYTE_ORDER__ == __ORDER_LITTLE_ENDIAN__, "vertices and triangles are hashed as they lie in memory");
+
 static void hash_u32(struct sha256 *sha, uint32_t value)
 {
 	uint8_t bytes[4] = {(uint8_t)value, (uint8_t)(value >> 8), (uint8_t)(value >> 16), (uint8_t)(value >> 24)};
 	sha256_add(sha, bytes, sizeof bytes);
-}
-
-static void hash_vertices(struct sha256 *sha, const struct patch *patch)
-{
-	for (uint32_t v = 0; v < patch->nv; v++) {
-		uint8_t bytes[6];
-		for (int a = 0; a < 3; a++) {
-			bytes[2 * a] = (uint8_t)patch->vertex[v][a];
-			bytes[2 * a + 1] = (uint8_t)(patch->vertex[v][a] >> 8);
-		}
-		sha256_add(sha, bytes, sizeof bytes);
-	}
 }
 
 /* Runs of one plane stand together, so a plane is met for the first time when it differs from the run before. */
@@ -367,10 +357,8 @@ static void hash_patch(struct sha256 *sha, const struct patch *patch)
 	hash_u32(sha, (uint32_t)patch->key.z);
 	hash_u32(sha, patch->nv);
 	hash_u32(sha, patch->nt);
-	hash_vertices(sha, patch);
-	for (uint32_t t = 0; t < patch->nt; t++)
-		for (int c = 0; c < 3; c++)
-			hash_u32(sha, patch->triangle[t][c]);
+	sha256_add(sha, patch->vertex, patch->nv * sizeof *patch->vertex);
+	sha256_add(sha, patch->triangle, patch->nt * sizeof *patch->triangle);
 	for (uint32_t i = 0; i < patch->nruns; i++) {
 		const struct patch_run *run = &patch->run[i];
 		if (run->plane != PLANE_NONE)

@@ -32,23 +32,38 @@ static void schedule(const uint8_t block[64], uint32_t w[64])
 	}
 }
 
-static void compress(uint32_t h[8], const uint8_t block[64])
+/* One round on the eight working variables, a .. h; instead of moving them on, the caller renames them. */
+static inline void turn(uint32_t a, uint32_t b, uint32_t c, uint32_t *d, uint32_t e, uint32_t f, uint32_t g,
+                        uint32_t *h, uint32_t word)
 {
-	uint32_t w[64], s[8];
+	uint32_t sum1 = rotate(e, 6) ^ rotate(e, 11) ^ rotate(e, 25), choice = (e & f) ^ (~e & g);
+	uint32_t sum0 = rotate(a, 2) ^ rotate(a, 13) ^ rotate(a, 22), majority = (a & b) ^ (a & c) ^ (b & c);
+	uint32_t t1 = *h + sum1 + choice + word;
+	*d += t1;
+	*h = t1 + sum0 + majority;
+}
+
+static void compress(uint32_t state[8], const uint8_t block[64])
+{
+	uint32_t w[64];
+	uint32_t a = state[0], b = state[1], c = state[2], d = state[3];
+	uint32_t e = state[4], f = state[5], g = state[6], h = state[7];
 	schedule(block, w);
-	memcpy(s, h, sizeof s);
-	for (int t = 0; t < 64; t++) {
-		uint32_t sum1 = rotate(s[4], 6) ^ rotate(s[4], 11) ^ rotate(s[4], 25);
-		uint32_t choice = (s[4] & s[5]) ^ (~s[4] & s[6]);
-		uint32_t t1 = s[7] + sum1 + choice + round_constant[t] + w[t];
-		uint32_t sum0 = rotate(s[0], 2) ^ rotate(s[0], 13) ^ rotate(s[0], 22);
-		uint32_t majority = (s[0] & s[1]) ^ (s[0] & s[2]) ^ (s[1] & s[2]);
-		memmove(s + 1, s, 7 * sizeof *s);
-		s[4] += t1;
-		s[0] = t1 + sum0 + majority;
+	for (int t = 0; t < 64; t++)
+		w[t] += round_constant[t];
+	for (int t = 0; t < 64; t += 8) {
+		turn(a, b, c, &d, e, f, g, &h, w[t]);
+		turn(h, a, b, &c, d, e, f, &g, w[t + 1]);
+		turn(g, h, a, &b, c, d, e, &f, w[t + 2]);
+		turn(f, g, h, &a, b, c, d, &e, w[t + 3]);
+		turn(e, f, g, &h, a, b, c, &d, w[t + 4]);
+		turn(d, e, f, &g, h, a, b, &c, w[t + 5]);
+		turn(c, d, e, &f, g, h, a, &b, w[t + 6]);
+		turn(b, c, d, &e, f, g, h, &a, w[t + 7]);
 	}
+	const uint32_t result[8] = {a, b, c, d, e, f, g, h};
 	for (int i = 0; i < 8; i++)
-		h[i] += s[i];
+		state[i] += result[i];
 }
 
 void sha256_init(struct sha256 *sha)

@@ -5,12 +5,13 @@
 #include <stdlib.h>
 #include <string.h>
 
+#include "config/keys.h"
 #include "daemon/daemon.h"
 
 #define CONFIG_BYTES_MAX (1u << 20)
 #define CONFIG_DEFAULT   "/etc/facetd/facetd.yaml"
 
-enum { OPTION_CHECK = 256, OPTION_JOURNAL, OPTION_REPLAY };
+enum { OPTION_CHECK = 256, OPTION_JOURNAL, OPTION_REPLAY, OPTION_MANUAL };
 
 struct arguments {
 	const char *config, *journal;
@@ -21,6 +22,8 @@ static const struct argp_option options[] = {
     {"config", 'c', "FILE", 0, "configuration (default: $FACETD_CONFIG, then " CONFIG_DEFAULT ")", 0},
     {"check-config", OPTION_CHECK, NULL, 0, "say whether the configuration is right, and end", 0},
     {"journal", OPTION_JOURNAL, "FILE", 0, "keep what the devices sent in FILE, for tests and the search for faults",
+     0},
+    {"manual", OPTION_MANUAL, NULL, 0, "print the manual of the configuration, itself a configuration with every key",
      0},
     {"replay", OPTION_REPLAY, "FILE", 0, "not yet: recordings come in a later version", 0},
     {0},
@@ -40,6 +43,9 @@ static error_t parse(int key, char *value, struct argp_state *state)
 	case OPTION_JOURNAL:
 		arguments->journal = value;
 		return 0;
+	case OPTION_MANUAL:
+		keys_write_manual(stdout);
+		exit(fflush(stdout) ? 1 : 0);
 	case OPTION_REPLAY:
 		argp_failure(state, 2, 0,
 		             "--replay: recordings come in a later version; run devices, or facet simulate");

@@ -193,7 +193,7 @@ static struct extent extent_of(const struct canvas *canvas, const struct point *
 	return all;
 }
 
-/* The same without the outermost 200th of the area at either end: stray specks that a scanner saw through a window do
+/* The same without the outermost 300th of the area at either end: stray specks that a scanner saw through a window do
  * not make the building small. They are still drawn where they fall into the picture. */
 static struct extent trimmed_extent(const struct canvas *canvas, const struct point *corner, int axis)
 {
@@ -206,9 +206,9 @@ static struct extent trimmed_extent(const struct canvas *canvas, const struct po
 		total += area;
 	}
 	int low = 0, high = EXTENT_BINS - 1;
-	for (sum = bin[0]; sum < 0.005 * total && low < high; sum += bin[low])
+	for (sum = bin[0]; sum < 0.003 * total && low < high; sum += bin[low])
 		low++;
-	for (sum = bin[high]; sum < 0.005 * total && high > low; sum += bin[high])
+	for (sum = bin[high]; sum < 0.003 * total && high > low; sum += bin[high])
 		high--;
 	return (struct extent){all.low + width * (float)low, all.low + width * (float)(high + 1)};
 }

@@ -23,6 +23,7 @@
 #define ANSWER_MS  2000
 #define CONNECT_MS 2000
 #define COLUMNS    100 /* where nobody knows */
+#define OTHERS_MAX 100 /* lines that may stand before an answer */
 
 enum { OPTION_ONCE = 256, OPTION_JSON };
 
@@ -137,7 +138,7 @@ static void put_map(FILE *out, json_t *status)
 		fprintf(out, ", FULL: %s blocks refused", grouped(number(status, "memory.refused_blocks")));
 	fprintf(out, "\nqueue      %s of %s rows\n", grouped(number(status, "queue.length")),
 	        grouped(number(status, "queue.cap")));
-	fprintf(out, "latency    p50 %.1f ms, p99 %.1f ms from a profile's last byte to its commit\n",
+	fprintf(out, "latency    p50 %.1f ms, p99 %.1f ms from a profile's last byte until its changes can be sent\n",
 	        number(status, "latency_ms.p50"), number(status, "latency_ms.p99"));
 }
 
@@ -265,11 +266,40 @@ static void show_loss(struct watch *watch, const char *why)
 		return;
 	snprintf(watch->lost, sizeof(watch->lost), "%s", why);
 	if (watch->terminal) {
-		snprintf(text, sizeof(text), "%s\n\nTrying again every second; Ctrl-C ends.\n", why);
+		const int first = (int)strcspn(why, ";"); /* what to do stands in a line of its own */
+		snprintf(text, sizeof(text), "%.*s\n%s\n\nTrying again every second; Ctrl-C ends.\n", first, why,
+		         why[first] ? why + first + 2 : "");
 		terminal_draw(text);
 	} else {
 		fprintf(stderr, "facet: %s\n", why);
 	}
+}
+
+/* The next line that is a status or an error; a greeting and events may stand before it. NULL with a sentence. */
+static json_t *read_answer(struct watch *watch, const char **ret_line, char error[CLIENT_ERROR_MAX])
+{
+	for (int i = 0; i < OTHERS_MAX; i++) {
+		const int status = client_line(watch->client, ANSWER_MS, ret_line, error);
+		if (status == 0)
+			snprintf(error, CLIENT_ERROR_MAX, "%s: no answer within %d s", client_address(watch->client),
+			         ANSWER_MS / 1000);
+		if (status <= 0)
+			return NULL;
+		json_t *json = json_loads(*ret_line, 0, NULL);
+		const char *class = string(json, "class");
+		if (strcmp(class, "STATUS") == 0)
+			return json;
+		if (strcmp(class, "ERROR") == 0 || !class[0]) {
+			const char *why = string(json, "error");
+			snprintf(error, CLIENT_ERROR_MAX, "%s: %s", client_address(watch->client),
+			         why[0] ? why : "what answers there is not facetd");
+			json_decref(json);
+			return NULL;
+		}
+		json_decref(json);
+	}
+	snprintf(error, CLIENT_ERROR_MAX, "%s: no status among many answers", client_address(watch->client));
+	return NULL;
 }
 
 /* Asks and shows. 0, or -errno with a sentence. */
@@ -280,23 +310,12 @@ static int ask(struct watch *watch, char error[CLIENT_ERROR_MAX])
 		watch->client = client_open(watch->address, CONNECT_MS, error);
 	if (!watch->client)
 		return -ENOTCONN;
-	int status = client_say(watch->client, "?STATUS", error);
+	const int status = client_say(watch->client, "?STATUS", error);
 	if (status)
 		return status;
-	status = client_line(watch->client, ANSWER_MS, &line, error);
-	if (status == 0)
-		snprintf(error, CLIENT_ERROR_MAX, "%s: no answer within %d s", client_address(watch->client),
-		         ANSWER_MS / 1000);
-	if (status <= 0)
-		return status ? status : -ETIMEDOUT;
-	json_t *json = json_loads(line, 0, NULL);
-	if (strcmp(string(json, "class"), "STATUS") != 0) {
-		const char *why = string(json, "error");
-		snprintf(error, CLIENT_ERROR_MAX, "%s: %s", client_address(watch->client),
-		         why[0] ? why : "what answers there is not facetd");
-		json_decref(json);
+	json_t *json = read_answer(watch, &line, error);
+	if (!json)
 		return -EPROTO;
-	}
 	watch->lost[0] = '\0';
 	show_status(watch, line, json);
 	json_decref(json);

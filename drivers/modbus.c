@@ -25,6 +25,8 @@ struct decoder {
 	int index;
 	int64_t rtt_ns[RTT_KEPT];
 	int rtt_n, rtt_next;
+	double last_rad; /* of the answer before, a refused one too */
+	bool answered;
 	uint64_t count[COUNTERS];
 };
 
@@ -95,7 +97,12 @@ static void decode_angle(struct decoder *d, const struct modbus_transaction *t, 
 		d->count[MALFORMED]++;
 		return;
 	}
-	if (rtt_is_slow(d, rtt_ns)) {
+	bool stands = d->answered && tilt.angle_rad == d->last_rad;
+
+	d->answered = true;
+	d->last_rad = tilt.angle_rad;
+	/* When a servo that stands was read does not matter: such an answer is good however long it took. */
+	if (rtt_is_slow(d, rtt_ns) && !stands) {
 		d->count[SLOW]++;
 		return;
 	}

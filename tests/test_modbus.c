@@ -281,7 +281,7 @@ static void a_slow_round_trip_is_refused_and_a_slower_bus_is_followed(void **sta
 		feed(decoder, &t, &seen);
 	}
 	assert_int_equal(seen.tilts, 20);
-	struct modbus_transaction three = angle_of(300 * MS, 6 * MS, 0), more = angle_of(320 * MS, 6 * MS + 3, 0);
+	struct modbus_transaction three = angle_of(300 * MS, 6 * MS, 0), more = angle_of(320 * MS, 6 * MS + 3, 5);
 
 	feed(decoder, &three, &seen);
 	assert_int_equal(seen.tilts, 21);
@@ -294,6 +294,28 @@ static void a_slow_round_trip_is_refused_and_a_slower_bus_is_followed(void **sta
 		feed(decoder, &t, &seen);
 	}
 	assert_true(seen.tilts > 21 + 20);
+	driver_modbus.decoder_destroy(decoder);
+}
+
+static void a_slow_answer_of_a_servo_that_stands_is_taken(void **state)
+{
+	struct config config = servo_config();
+	struct decoder *decoder = driver_modbus.decoder_create(&config.device[0], 0);
+	struct seen seen = {0};
+
+	(void)state;
+	for (int i = 0; i < 20; i++) {
+		struct modbus_transaction t = angle_of(i * 10 * MS, 2 * MS, 0);
+
+		feed(decoder, &t, &seen);
+	}
+	struct modbus_transaction moved = angle_of(300 * MS, 20 * MS, 7), stood = angle_of(330 * MS, 20 * MS, 7);
+
+	feed(decoder, &moved, &seen);
+	assert_int_equal(seen.tilts, 20);
+	feed(decoder, &stood, &seen);
+	assert_int_equal(seen.tilts, 21);
+	assert_int_equal(counter(decoder, "slow"), 1);
 	driver_modbus.decoder_destroy(decoder);
 }
 
@@ -916,6 +938,7 @@ int main(void)
 	    cmocka_unit_test(every_cut_record_waits_and_every_bad_one_is_refused),
 	    cmocka_unit_test(an_angle_is_stamped_at_the_midpoint),
 	    cmocka_unit_test(a_slow_round_trip_is_refused_and_a_slower_bus_is_followed),
+	    cmocka_unit_test(a_slow_answer_of_a_servo_that_stands_is_taken),
 	    cmocka_unit_test(foreign_refused_and_absurd_records_are_counted_not_decoded),
 	    cmocka_unit_test(a_triangle_sweeps_between_its_ends_for_hours),
 	    cmocka_unit_test(a_sinus_slows_down_towards_its_ends),

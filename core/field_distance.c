@@ -338,7 +338,8 @@ void field_point(struct field *field, struct vec3 origin, struct vec3 point)
 	double scale = 1 / field->params.cell_m;
 	struct vec3 p = vec3_scale(point, scale), o = vec3_scale(origin, scale);
 
-	if (!(fabs(p.x) < limit && fabs(p.y) < limit && fabs(p.z) < limit)) {
+	if (!(fabs(p.x) < limit && fabs(p.y) < limit && fabs(p.z) < limit && fabs(o.x) < limit && fabs(o.y) < limit &&
+	      fabs(o.z) < limit)) {
 		field->stats.far_points++;
 		return;
 	}

@@ -42,31 +42,27 @@ static bool thick(const int64_t normal[3], const int32_t a[3], const int32_t b[3
 	return squared(normal) > ALTITUDE_MIN * ALTITUDE_MIN * (double)longest;
 }
 
-bool guard_altitude(const int32_t a[3], const int32_t b[3], const int32_t c[3])
+bool guard_turn(const int32_t v[3], const int32_t to[3], const int32_t b[3], const int32_t c[3], double cosine)
 {
-	int64_t normal[3];
-	triangle_normal(a, b, c, normal);
-	return thick(normal, a, b, c);
+	int64_t before[3], after[3];
+	triangle_normal(v, b, c, before);
+	triangle_normal(to, b, c, after);
+	if (!thick(after, to, b, c))
+		return false;
+	double dot = (double)before[0] * (double)after[0] + (double)before[1] * (double)after[1] +
+	             (double)before[2] * (double)after[2];
+	double bound = cosine * cosine * squared(before) * squared(after);
+	return cosine >= 0 ? dot > 0 && dot * dot > bound : dot >= 0 || dot * dot < bound;
 }
 
 bool guard_shape(const struct halfedge_mesh *mesh, uint32_t h, uint32_t v, double cosine)
 {
 	uint32_t u = halfedge_other(mesh, h, v);
-	const int32_t *to = mesh->position[u];
 	HALFEDGE_EACH(mesh, e, v)
 	{
 		uint32_t x = halfedge_target(mesh, e), y = mesh->origin[halfedge_previous(e)];
-		if (x == u || y == u)
-			continue;
-		int64_t before[3], after[3];
-		triangle_normal(mesh->position[v], mesh->position[x], mesh->position[y], before);
-		triangle_normal(to, mesh->position[x], mesh->position[y], after);
-		if (!thick(after, to, mesh->position[x], mesh->position[y]))
-			return false;
-		double dot = (double)before[0] * (double)after[0] + (double)before[1] * (double)after[1] +
-		             (double)before[2] * (double)after[2];
-		double bound = cosine * cosine * squared(before) * squared(after);
-		if (cosine >= 0 ? dot <= 0 || dot * dot <= bound : dot < 0 && dot * dot >= bound)
+		if (x != u && y != u &&
+		    !guard_turn(mesh->position[v], mesh->position[u], mesh->position[x], mesh->position[y], cosine))
 			return false;
 	}
 	return true;

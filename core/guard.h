@@ -11,7 +11,7 @@ bool guard_patch_faces(struct halfedge_mesh *mesh, const uint8_t *faces, uint32_
 /* Whether no triangle of v turns by more than the angle of cosine `cosine` and none gets thin. */
 bool guard_shape(const struct halfedge_mesh *mesh, uint32_t h, uint32_t v, double cosine);
 
-/* Whether all triangles of v have an area and none is thin. */
-bool guard_altitude(const int32_t a[3], const int32_t b[3], const int32_t c[3]);
+/* Whether the triangle v, b, c turns by less than the angle of cosine `cosine` and does not get thin when v goes to `to`. */
+bool guard_turn(const int32_t v[3], const int32_t to[3], const int32_t b[3], const int32_t c[3], double cosine);
 
 #endif

@@ -8,6 +8,7 @@
 #include "core/border_fit.h"
 #include "core/region.h"
 #include "core/simplify.h"
+#include "core/smooth.h"
 
 /* What is left of the mesh, vertices and triangles in their old order. */
 static int gather(const struct simplify *s, struct arena *arena, struct surface *ret)
@@ -57,7 +58,9 @@ int reduce_surface(const struct window *window, const struct surface *raw, const
 		return r;
 	border_fit(&s.mesh, &s.border, stats);
 	simplify_settle(&s);
-	r = region_flatten(&s, arena, stats);
+	r = smooth_step(&s, arena);
+	if (!r)
+		r = region_flatten(&s, arena, stats);
 	if (!r)
 		r = simplify_collapse(&s, arena);
 	return r ? r : gather(&s, arena, ret);

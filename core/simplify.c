@@ -26,7 +26,8 @@
 #define FLATS_MAX    256   /* triangles at a vertex before that */
 #define RIM_SIDEWAYS 0.5   /* cells */
 #define RIM_GAP      5     /* lattice units a rim vertex keeps from other rim edges, 0.02 cell */
-#define LENGTH_SHARE 0.002 /* of the squared way, in the cost */
+#define ERROR_SHARE  0.1   /* of the sum of squared distances, in the cost */
+#define LENGTH_SHARE 0.002 /* of the squared way */
 
 struct target {
 	double cost;
@@ -37,6 +38,10 @@ struct pass {
 	struct simplify *s;
 	uint32_t *heap, *place, n; /* place [nv] in the heap, or UINT32_MAX */
 	double *key;               /* [nv] */
+	double *own;               /* [nv] quadric at its own place */
+	struct target *best;       /* [nv] */
+	bool *stale;               /* [nv] `best` may have changed */
+	bool *on_rim;              /* [nv] */
 	uint8_t *tried;            /* [nv] targets refused since the last change around */
 	uint32_t *rim, rims;       /* vertices that were on a border at the start */
 	struct flat flat[FLATS_MAX];
@@ -78,7 +83,7 @@ int simplify_init(struct simplify *s, const struct surface *raw, const struct bo
 			continue;
 		double unit[3] = {normal.x / length, normal.y / length, normal.z / length}, at[3] = {a.x, a.y, a.z};
 		for (int k = 0; k < 3; k++)
-			quadric_add_plane(&s->quadric[corner[k]], unit, at, 1);
+			quadric_add_plane(&s->quadric[corner[k]], unit, at, length / (LATTICE * LATTICE));
 	}
 	return 0;
 }
@@ -153,22 +158,53 @@ static void heap_set(struct pass *pass, uint32_t v, double key)
 	sift_up(pass, pass->n++, v);
 }
 
-/* Cost of moving v into u, or a negative number where the mean quadric is beyond the tolerance. */
-static double cost_of(const struct simplify *s, uint32_t v, uint32_t u)
+static void note_own(struct pass *pass, uint32_t u)
 {
-	const int32_t *to = s->mesh.position[u];
-	const double at[3] = {to[0], to[1], to[2]};
-	double sum = quadric_at(&s->quadric[v], at) + quadric_at(&s->quadric[u], at);
-	double mean = sum / (s->quadric[v].planes + s->quadric[u].planes);
-	if (mean > s->tolerance_squared)
-		return -1;
-	return (mean > 0 ? mean : 0) + LENGTH_SHARE * (double)distance_squared3(s->mesh.position[v], to);
+	const int32_t *p = pass->s->mesh.position[u];
+	const double at[3] = {p[0], p[1], p[2]};
+	pass->own[u] = quadric_at(&pass->s->quadric[u], at);
 }
 
-static void add_target(const struct simplify *s, uint32_t v, uint32_t h, struct target *target, uint32_t *n)
+/* Cost of moving v into u, or a negative number where the mean quadric is beyond the tolerance. */
+static double cost_of(const struct pass *pass, uint32_t v, uint32_t u)
 {
-	uint32_t u = halfedge_other(&s->mesh, h, v);
-	double cost = cost_of(s, v, u);
+	const struct simplify *s = pass->s;
+	const int32_t *to = s->mesh.position[u];
+	const double at[3] = {to[0], to[1], to[2]};
+	double sum = quadric_at(&s->quadric[v], at) + pass->own[u];
+	if (sum > s->tolerance_squared * (s->quadric[v].planes + s->quadric[u].planes))
+		return -1;
+	double cost = ERROR_SHARE * sum + LENGTH_SHARE * (double)distance_squared3(s->mesh.position[v], to);
+	return cost > 0 ? cost : 0;
+}
+
+static void look_at(const struct pass *pass, uint32_t v, uint32_t h, struct target *best)
+{
+	uint32_t u = halfedge_other(&pass->s->mesh, h, v);
+	double cost = cost_of(pass, v, u);
+	if (cost >= 0 && (cost < best->cost || (cost == best->cost && u < best->u)))
+		*best = (struct target){cost, u, h};
+}
+
+/* The cheapest target of v; its u is HALFEDGE_NONE where there is none. */
+static struct target best_target(const struct pass *pass, uint32_t v)
+{
+	const struct halfedge_mesh *mesh = &pass->s->mesh;
+	struct target best = {INFINITY, HALFEDGE_NONE, HALFEDGE_NONE};
+	if (pass->on_rim[v]) {
+		look_at(pass, v, halfedge_border_from(mesh, v), &best);
+		look_at(pass, v, halfedge_border_into(mesh, v), &best);
+		return best;
+	}
+	HALFEDGE_EACH(mesh, h, v)
+	look_at(pass, v, h, &best);
+	return best;
+}
+
+static void add_target(const struct pass *pass, uint32_t v, uint32_t h, struct target *target, uint32_t *n)
+{
+	uint32_t u = halfedge_other(&pass->s->mesh, h, v);
+	double cost = cost_of(pass, v, u);
 	if (cost < 0 || *n == VALENCE_MAX)
 		return;
 	uint32_t k = (*n)++;
@@ -180,30 +216,42 @@ static void add_target(const struct simplify *s, uint32_t v, uint32_t h, struct 
 }
 
 /* Where v may go, cheapest first. */
-static uint32_t find_targets(const struct simplify *s, uint32_t v, struct target *target)
+static uint32_t find_targets(const struct pass *pass, uint32_t v, struct target *target)
 {
-	const struct halfedge_mesh *mesh = &s->mesh;
-	uint32_t n = 0, from = halfedge_border_from(mesh, v);
-	if (from != HALFEDGE_NONE) {
-		add_target(s, v, from, target, &n);
-		add_target(s, v, halfedge_border_into(mesh, v), target, &n);
+	const struct halfedge_mesh *mesh = &pass->s->mesh;
+	uint32_t n = 0;
+	if (pass->on_rim[v]) {
+		add_target(pass, v, halfedge_border_from(mesh, v), target, &n);
+		add_target(pass, v, halfedge_border_into(mesh, v), target, &n);
 		return n;
 	}
 	HALFEDGE_EACH(mesh, h, v)
-	add_target(s, v, h, target, &n);
+	add_target(pass, v, h, target, &n);
 	return n;
 }
 
+/* What v would cost, as of now. */
 static void give_turn(struct pass *pass, uint32_t v)
 {
-	struct target target[VALENCE_MAX];
-	if (pass->s->fixed[v] || pass->s->mesh.first[v] == HALFEDGE_NONE)
-		return;
 	pass->tried[v] = 0;
-	if (find_targets(pass->s, v, target))
-		heap_set(pass, v, target[0].cost);
+	pass->stale[v] = false;
+	pass->best[v] = best_target(pass, v);
+	if (pass->best[v].u != HALFEDGE_NONE)
+		heap_set(pass, v, pass->best[v].cost);
 	else
 		heap_remove(pass, v);
+}
+
+/* Something around v has changed. Its cost is looked at when its turn comes, but at once where it has none, or where
+ * its target has changed. */
+static void notice(struct pass *pass, uint32_t v, uint32_t gone, uint32_t changed)
+{
+	if (pass->s->fixed[v])
+		return;
+	pass->stale[v] = true;
+	uint32_t target = pass->best[v].u;
+	if (pass->place[v] == UINT32_MAX || pass->tried[v] || target == gone || target == changed)
+		give_turn(pass, v);
 }
 
 /* The triangles that stay when v moves into u, as they then lie; where none does, the one behind h's tip. */
@@ -377,6 +425,7 @@ static void commit(struct pass *pass, uint32_t v, uint32_t u, uint32_t h, bool r
 	if (g != HALFEDGE_NONE)
 		follow_rims(s, g);
 	quadric_add(&s->quadric[u], &s->quadric[v]);
+	note_own(pass, u);
 	halfedge_collapse(mesh, h, v);
 	if (rim) {
 		uint32_t e = halfedge_find(mesh, w, u);
@@ -404,52 +453,85 @@ static bool try_target(struct pass *pass, uint32_t v, const struct target *targe
 	return true;
 }
 
-static void take_turn(struct pass *pass, uint32_t v)
+static void notice_around(struct pass *pass, uint32_t u, uint32_t gone)
 {
-	struct target target[VALENCE_MAX];
-	uint32_t n = find_targets(pass->s, v, target), k = pass->tried[v];
-	heap_remove(pass, v);
-	if (k >= n)
-		return;
-	if (!try_target(pass, v, &target[k])) {
-		if (++pass->tried[v] < n)
-			heap_set(pass, v, target[k + 1].cost);
-		return;
-	}
 	const struct halfedge_mesh *mesh = &pass->s->mesh;
-	uint32_t u = target[k].u;
-	give_turn(pass, u);
+	if (!pass->s->fixed[u])
+		give_turn(pass, u);
 	HALFEDGE_EACH(mesh, h, u)
 	{
-		give_turn(pass, halfedge_target(mesh, h));
+		notice(pass, halfedge_target(mesh, h), gone, u);
 		if (mesh->twin[halfedge_previous(h)] == HALFEDGE_NONE)
-			give_turn(pass, mesh->origin[halfedge_previous(h)]);
+			notice(pass, mesh->origin[halfedge_previous(h)], gone, u);
 	}
+}
+
+static void take_turn(struct pass *pass, uint32_t v)
+{
+	if (pass->stale[v]) {
+		double before = pass->key[v];
+		give_turn(pass, v);
+		if (pass->place[v] == UINT32_MAX || pass->key[v] > before)
+			return;
+	}
+	uint32_t k = pass->tried[v];
+	struct target target = pass->best[v];
+	heap_remove(pass, v);
+	if (!try_target(pass, v, &target)) {
+		struct target all[VALENCE_MAX];
+		uint32_t n = find_targets(pass, v, all);
+		pass->tried[v] = (uint8_t)++k;
+		if (k < n) {
+			pass->best[v] = all[k];
+			heap_set(pass, v, all[k].cost);
+		}
+		return;
+	}
+	notice_around(pass, target.u, v);
+}
+
+static int reserve(struct pass *pass, uint32_t nv, struct arena *arena)
+{
+	pass->heap = ARENA_NEW(arena, uint32_t, nv);
+	pass->place = ARENA_NEW(arena, uint32_t, nv);
+	pass->key = ARENA_NEW(arena, double, nv);
+	pass->own = ARENA_NEW(arena, double, nv);
+	pass->best = ARENA_NEW(arena, struct target, nv);
+	pass->stale = ARENA_NEW(arena, bool, nv);
+	pass->on_rim = ARENA_NEW(arena, bool, nv);
+	pass->tried = ARENA_NEW(arena, uint8_t, nv);
+	pass->rim = ARENA_NEW(arena, uint32_t, nv);
+	pass->point = ARENA_NEW(arena, uint32_t, nv);
+	pass->point_triangle = ARENA_NEW(arena, uint32_t, nv);
+	if (!pass->heap || !pass->place || !pass->key || !pass->own || !pass->best || !pass->stale || !pass->on_rim ||
+	    !pass->tried || !pass->rim || !pass->point || !pass->point_triangle)
+		return -ENOMEM;
+	memset(pass->place, 0xff, nv * sizeof *pass->place);
+	return 0;
 }
 
 int simplify_collapse(struct simplify *s, struct arena *arena)
 {
 	uint32_t nv = s->mesh.nv;
+	int r;
 	struct pass *pass = ARENA_NEW(arena, struct pass, 1);
 	if (!pass)
 		return -ENOMEM;
 	pass->s = s;
-	pass->heap = ARENA_NEW(arena, uint32_t, nv);
-	pass->place = ARENA_NEW(arena, uint32_t, nv);
-	pass->key = ARENA_NEW(arena, double, nv);
-	pass->tried = ARENA_NEW(arena, uint8_t, nv);
-	pass->rim = ARENA_NEW(arena, uint32_t, nv);
-	pass->point = ARENA_NEW(arena, uint32_t, nv);
-	pass->point_triangle = ARENA_NEW(arena, uint32_t, nv);
-	if (!pass->heap || !pass->place || !pass->key || !pass->tried || !pass->rim || !pass->point ||
-	    !pass->point_triangle)
-		return -ENOMEM;
-	memset(pass->place, 0xff, nv * sizeof *pass->place);
+	r = reserve(pass, nv, arena);
+	if (r)
+		return r;
 	for (uint32_t v = 0; v < nv; v++) {
-		if (halfedge_border_from(&s->mesh, v) != HALFEDGE_NONE)
+		if (s->mesh.first[v] == HALFEDGE_NONE)
+			continue;
+		note_own(pass, v);
+		pass->on_rim[v] = halfedge_border_from(&s->mesh, v) != HALFEDGE_NONE;
+		if (pass->on_rim[v])
 			pass->rim[pass->rims++] = v;
-		give_turn(pass, v);
 	}
+	for (uint32_t v = 0; v < nv; v++)
+		if (s->mesh.first[v] != HALFEDGE_NONE && !s->fixed[v])
+			give_turn(pass, v);
 	while (pass->n)
 		take_turn(pass, pass->heap[0]);
 	return 0;

@@ -65,6 +65,9 @@ int simplify_init(struct simplify *s, const struct surface *raw, const struct bo
 	s->points = ARENA_NEW(arena, uint32_t, cap_nt);
 	s->plane = ARENA_NEW(arena, uint32_t, cap_nt);
 	s->rim_points = ARENA_NEW(arena, uint32_t, 3 * (size_t)cap_nt);
+	r = nearby_init(&s->nearby, raw, arena);
+	if (r)
+		return r;
 	if (!s->origin || !s->quadric || !s->fixed || !s->next_point || !s->points || !s->plane || !s->rim_points)
 		return -ENOMEM;
 	memset(s->points, 0xff, cap_nt * sizeof *s->points);
@@ -433,6 +436,21 @@ static void commit(struct pass *pass, uint32_t v, uint32_t u, uint32_t h, bool r
 	}
 }
 
+/* Whether the new edges of u and the middles of its new triangles run where the raw surface was. */
+static bool flats_stay_near(const struct pass *pass)
+{
+	const struct nearby *nearby = &pass->s->nearby;
+	for (uint32_t f = 0; f < pass->flats; f++) {
+		const struct flat *flat = &pass->flat[f];
+		struct vec3 middle = vec3_scale(vec3_add(flat->ab, flat->ac), 0.5);
+		if (!nearby_has_segment(nearby, flat->a, vec3_add(flat->a, flat->ab)) ||
+		    !nearby_has_segment(nearby, flat->a, vec3_add(flat->a, flat->ac)) ||
+		    !nearby_has_segment(nearby, flat->a, vec3_add(flat->a, middle)))
+			return false;
+	}
+	return true;
+}
+
 static bool try_target(struct pass *pass, uint32_t v, const struct target *target)
 {
 	struct simplify *s = pass->s;
@@ -447,7 +465,7 @@ static bool try_target(struct pass *pass, uint32_t v, const struct target *targe
 	if (rim && (!rim_stays_near(pass, v, u, h) ||
 	            !rim_clear(pass, halfedge_other(mesh, other_rim_edge(mesh, v, h), v), u, v)))
 		return false;
-	if (!points_stay_near(pass, v, rim))
+	if (!points_stay_near(pass, v, rim) || !flats_stay_near(pass))
 		return false;
 	commit(pass, v, u, h, rim);
 	return true;

@@ -9,6 +9,7 @@
 #include "core/border.h"
 #include "core/distance.h"
 #include "core/halfedge.h"
+#include "core/nearby.h"
 #include "core/quadric.h"
 
 struct region_plane;
@@ -24,6 +25,7 @@ struct simplify {
 	uint32_t *next_point;    /* [nv] */
 	uint32_t *plane;         /* [cap_nt] planar region, or UINT32_MAX */
 	struct region_plane *region;
+	struct nearby nearby;
 	double tolerance_squared; /* lattice units, squared */
 	double rim_squared;       /* how far an open rim may move sideways, squared */
 };

@@ -12,6 +12,7 @@
 
 #include "config/config.h"
 #include "config/keys.h"
+#include "tests/scarce.h"
 
 #define DEG                  0.017453292519943295
 #define assert_near(a, b, e) assert_true(fabs((a) - (b)) <= (e))
@@ -372,6 +373,33 @@ static void every_shorter_file_is_taken_or_refused_in_peace(void **state)
 	}
 }
 
+static void memory_that_runs_out_anywhere_is_said_and_nothing_is_kept(void **state)
+{
+	(void)state;
+	static struct config config, untouched;
+	if (!SCARCE_WORKS)
+		skip();
+	memset(&untouched, 0x5a, sizeof(untouched));
+	int status = -ENOMEM;
+	long calls = 0;
+	for (; status != 0; calls++) {
+		struct config_error error;
+		config = untouched;
+		const long live = scarce_live;
+		scarce_left = calls;
+		status = read_text(building, &config, &error);
+		scarce_left = -1;
+		const long leaked = scarce_live - live;
+		assert_int_equal(leaked, 0);
+		if (status == 0)
+			break;
+		assert_int_equal(status, -ENOMEM);
+		assert_string_equal(error.text, "f.yaml: memory is out");
+		assert_memory_equal(&config, &untouched, sizeof(config));
+	}
+	assert_true(calls > 500);
+}
+
 static void edit_distance_counts_swaps_as_one(void **state)
 {
 	(void)state;
@@ -485,6 +513,7 @@ int main(int argc, char **argv)
 	    cmocka_unit_test(what_is_not_yaml_names_its_line),
 	    cmocka_unit_test(size_and_depth_are_bounded),
 	    cmocka_unit_test(every_shorter_file_is_taken_or_refused_in_peace),
+	    cmocka_unit_test(memory_that_runs_out_anywhere_is_said_and_nothing_is_kept),
 	    cmocka_unit_test(edit_distance_counts_swaps_as_one),
 	    cmocka_unit_test(the_scanner_gets_its_mount_masks_and_pose),
 	    cmocka_unit_test(the_manual_in_the_repository_is_the_tables),

@@ -537,9 +537,11 @@ static struct row *random_row(uint64_t *seed)
 {
 	uint32_t n = 1 + (uint32_t)random_in(seed, 0, 200);
 	struct row *row = row_create(n);
-	double range = random_in(seed, 0.5, 6), tilt_rad = random_in(seed, -0.5, 0.5);
-	struct transform at = transform_rpy((struct vec3){random_in(seed, -2, 2), random_in(seed, -2, 2), 1},
-	                                    (struct vec3){0.01, tilt_rad, random_in(seed, -3, 3)});
+	double range = random_in(seed, 0.5, 6);
+	/* one after the other: the order in an initializer is the compiler's */
+	double tilt_rad = random_in(seed, -0.5, 0.5), yaw_rad = random_in(seed, -3, 3);
+	double x = random_in(seed, -2, 2), y = random_in(seed, -2, 2);
+	struct transform at = transform_rpy((struct vec3){x, y, 1}, (struct vec3){0.01, tilt_rad, yaw_rad});
 
 	row->step_rad = (random_in(seed, 0, 1) < 0.1 ? 1.0 : 0.5) * TRIG_DEG;
 	row->first_rad = -0.25 * n * TRIG_DEG;

@@ -27,6 +27,7 @@
 #define TRIES_MAX     3
 #define SILENCE_NS    3000000000 /* no angle for so long: given up */
 #define LOOK_NS       50000000   /* how often the movement is looked at while nothing else happens */
+#define IDLE_NS       500000000  /* the same without a sweep */
 #define REACHED_RAD   (0.1 * TRIG_DEG)
 #define NEAR_RAD      (1.0 * TRIG_DEG)
 #define STILL_RAD     (0.02 * TRIG_DEG)
@@ -65,8 +66,9 @@ struct dialogue {
 
 	bool angle_known;
 	double angle_rad, still_rad;
-	int64_t angle_ns, still_ns; /* it has stood near still_rad since still_ns */
-	int64_t alive_ns, stop_by_ns;
+	int64_t angle_ns, still_ns;   /* it has stood near still_rad since still_ns */
+	int64_t silent_ns, looked_ns; /* without an angle for so long, as far as it was looked at */
+	int64_t stop_by_ns;
 	char error[160];
 };
 
@@ -123,7 +125,8 @@ void modbus_dialogue_reset(struct dialogue *d, int64_t t_ns)
 	d->nudges = 0;
 	d->settling = false;
 	d->angle_known = false;
-	d->alive_ns = d->since_ns = t_ns;
+	d->silent_ns = 0;
+	d->looked_ns = d->since_ns = t_ns;
 	d->speed_rad_s = d->peak_rad_s;
 	d->speed_due = d->sweeps && d->device.speed.set && d->peak_rad_s > 0.0;
 	d->target_due = d->sweeps;
@@ -180,7 +183,7 @@ static void moved(struct dialogue *d, double angle_rad, int64_t t_ns)
 	d->angle_known = true;
 	d->angle_rad = angle_rad;
 	d->angle_ns = t_ns;
-	d->alive_ns = t_ns;
+	d->silent_ns = 0;
 }
 
 void modbus_dialogue_reply(struct dialogue *d, const struct reply *reply)
@@ -201,7 +204,8 @@ void modbus_dialogue_reply(struct dialogue *d, const struct reply *reply)
 
 void modbus_dialogue_data(struct dialogue *d, int64_t t_ns)
 {
-	d->alive_ns = t_ns;
+	(void)t_ns;
+	d->silent_ns = 0;
 }
 
 static void go(struct dialogue *d, double target_rad)
@@ -281,6 +285,16 @@ static void follow_sinus(struct dialogue *d)
 	d->speed_due = true;
 }
 
+/* A program that was itself stopped for seconds has not listened: that is no silence of the servo's. */
+static bool is_silent(struct dialogue *d, int64_t t_ns)
+{
+	int64_t gap_ns = t_ns - d->looked_ns;
+
+	d->silent_ns += gap_ns < IDLE_NS ? gap_ns : IDLE_NS;
+	d->looked_ns = t_ns;
+	return d->silent_ns > SILENCE_NS;
+}
+
 /* Decides, from the angles seen so far, what is to be written next. */
 static void look(struct dialogue *d, int64_t t_ns)
 {
@@ -288,7 +302,7 @@ static void look(struct dialogue *d, int64_t t_ns)
 		d->phase = RUNNING;
 	if (d->phase != RUNNING && d->phase != STOPPING)
 		return;
-	if (t_ns - d->alive_ns > SILENCE_NS) {
+	if (is_silent(d, t_ns)) {
 		fail(d, "gave no angle for 3 s", "check `unit` and `position`");
 		return;
 	}
@@ -366,10 +380,10 @@ static void write_wish(struct dialogue *d, int64_t t_ns, struct dialogue_step *r
 
 static int64_t deadline(const struct dialogue *d, int64_t t_ns)
 {
-	int64_t at_ns = d->sent ? d->sent_ns + ANSWER_NS : d->alive_ns + SILENCE_NS + 1;
+	int64_t at_ns = t_ns + (d->sweeps ? LOOK_NS : IDLE_NS);
 
-	if (d->sweeps && t_ns + LOOK_NS < at_ns)
-		at_ns = t_ns + LOOK_NS;
+	if (d->sent && d->sent_ns + ANSWER_NS < at_ns)
+		at_ns = d->sent_ns + ANSWER_NS;
 	if (d->settling && d->settled_ns > t_ns && d->settled_ns < at_ns)
 		at_ns = d->settled_ns;
 	return at_ns;

@@ -578,8 +578,14 @@ static void a_servo_without_a_sweep_is_read_and_never_told_anything(void **state
 	driver_modbus.dialogue_reset(d, t_ns);
 	assert_int_equal(virtual_run(d, &servo, &config, &t_ns, 10.0, &step, NULL, NULL), DIALOGUE_STREAMING);
 	assert_int_equal(servo.writes, 0);
-	t_ns += 3100 * MS;
+	/* A program that slept itself has not listened; one that looked and heard nothing for three seconds has. */
+	t_ns += 60000 * MS;
 	driver_modbus.dialogue_step(d, t_ns, &step);
+	assert_int_equal(step.state, DIALOGUE_STREAMING);
+	for (int i = 0; i < 100 && step.state != DIALOGUE_FAILED; i++) {
+		t_ns = step.deadline_ns;
+		driver_modbus.dialogue_step(d, t_ns, &step);
+	}
 	assert_int_equal(step.state, DIALOGUE_FAILED);
 	assert_non_null(strstr(step.error, "no angle"));
 	driver_modbus.dialogue_destroy(d);

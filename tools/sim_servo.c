@@ -9,6 +9,11 @@
  * raw before anybody opens it (a fresh one echoes), and kept open here, so that a driver that comes and goes does not
  * end the line. libmodbus is given the master's descriptor and never opens anything itself.
  *
+ * Who plays a recording through it wants to know which answers its reader took: an answer that came after the reader's
+ * time-out was thrown away, and one that was slow on its way is refused by a careful reader. The servo sees neither, but
+ * it sees when the next request comes. An answer counts when the pause before its request and the pause after it are
+ * both as short as such pauses usually are (the median of the last ones, and a millisecond).
+ *
  * Times are CLOCK_MONOTONIC in ns, as uv_hrtime says them. */
 #include "tools/simulator.h"
 
@@ -35,6 +40,9 @@
 #define SPEED_DEFAULT 30000.0 /* 0.001 degree/s */
 #define COUNT_RAD     (0.001 * TRIG_DEG)
 #define REQUEST_US    500000 /* a frame that began is whole by then, or dropped */
+#define PAUSES        31
+#define PAUSE_MORE_NS 1000000
+#define PAUSE_MAX_NS  200000000 /* shorter than any reader's time-out and recovery */
 
 struct leg { /* from t_ns on; counts of 0.001 degree */
 	int64_t t_ns;
@@ -56,6 +64,11 @@ struct sim_servo {
 	struct leg leg[LEGS];
 	uint32_t legs; /* ever begun; the newest is (legs - 1) % LEGS */
 	uint64_t answers;
+	int64_t pause_ns[PAUSES]; /* between an answer and the next request */
+	uint32_t pauses;
+	int64_t answered_ns; /* the last answer, of whatever */
+	bool prompt;         /* the request before it came in good time */
+	bool pending;        /* it carried the angle, and is to be counted when the next request comes */
 };
 
 static int64_t now_ns(void)
@@ -150,6 +163,34 @@ static int speak_rtu(struct sim_servo *s)
 	return 0;
 }
 
+static int64_t usual_pause(const struct sim_servo *s)
+{
+	int64_t sorted[PAUSES];
+	int n = s->pauses < PAUSES ? (int)s->pauses : PAUSES;
+
+	for (int i = 0; i < n; i++) {
+		int at = i;
+
+		for (; at > 0 && sorted[at - 1] > s->pause_ns[i]; at--)
+			sorted[at] = sorted[at - 1];
+		sorted[at] = s->pause_ns[i];
+	}
+	return n ? sorted[n / 2] : 0;
+}
+
+/* A request has come: what does that say about the answer before it? */
+static void judge_last_answer(struct sim_servo *s, int64_t t_ns)
+{
+	int64_t pause_ns = t_ns - s->answered_ns;
+	bool prompt = pause_ns <= PAUSE_MAX_NS && pause_ns <= usual_pause(s) + PAUSE_MORE_NS;
+
+	s->pause_ns[s->pauses++ % PAUSES] = pause_ns;
+	if (s->pending && s->prompt && prompt)
+		s->answers++;
+	s->prompt = prompt;
+	s->pending = false;
+}
+
 /* One request of the current line. False: the line is lost. An answer counts with the angle it carries. */
 static bool serve(struct sim_servo *s)
 {
@@ -164,11 +205,12 @@ static bool serve(struct sim_servo *s)
 	if (s->port && request[header - 1] != s->slave && request[header - 1] != MODBUS_TCP_SLAVE)
 		return true;
 	pthread_mutex_lock(&s->lock);
+	judge_last_answer(s, now_ns());
 	fill_registers(s, now_ns());
 	n = modbus_reply(s->modbus, request, n, s->map);
 	take_registers(s, now_ns());
-	if (n >= 0 && reads_position(request + header))
-		s->answers++;
+	s->pending = n >= 0 && reads_position(request + header);
+	s->answered_ns = now_ns();
 	pthread_mutex_unlock(&s->lock);
 	return n >= 0;
 }
@@ -363,6 +405,7 @@ void sim_servo_place(struct sim_servo *s, double angle_rad)
 
 	pthread_mutex_lock(&s->lock);
 	begin_leg(s, now_ns(), at, at, leg_at(s, now_ns())->speed);
+	s->pending = false; /* it carried the angle of before */
 	pthread_mutex_unlock(&s->lock);
 }
 

@@ -55,7 +55,7 @@ void sim_servo_destroy(struct sim_servo *);
 int sim_servo_port(const struct sim_servo *);                     /* TCP port it listens on */
 double sim_servo_angle(struct sim_servo *, int64_t t_ns);         /* rad, at any time within the last seconds (CLOCK_MONOTONIC, as uv_hrtime); any thread */
 void sim_servo_place(struct sim_servo *, double angle_rad);       /* stands there from now on (playback steps) */
-uint64_t sim_servo_answers(struct sim_servo *);                   /* position reads answered so far */
+uint64_t sim_servo_answers(struct sim_servo *);                   /* position reads so far whose answer was taken in good time, as the next request shows */
 
 /* Built-in worlds of flat and round things; distances in metres, map frame (z up, floor at 0). */
 struct world;

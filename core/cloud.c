@@ -11,8 +11,10 @@
 
 int cloud_add(struct cloud_builder *b, double x, double y, double z)
 {
-	if (!(fabs(x) <= FAR_M && fabs(y) <= FAR_M && fabs(z) <= FAR_M))
+	if (!(fabs(x) <= FAR_M && fabs(y) <= FAR_M && fabs(z) <= FAR_M)) {
+		b->left_out++;
 		return 0;
+	}
 	if (b->cloud.n == b->cap) {
 		size_t cap = b->cap ? b->cap * 2 : 1024;
 		struct vec3 *grown = realloc(b->cloud.point, cap * sizeof *grown);
@@ -35,7 +37,9 @@ int cloud_refuse(struct parse_error *error, uint32_t line, const char *sentence)
 int cloud_take(struct cloud_builder *b, int r, struct cloud *ret, struct parse_error *error)
 {
 	if (r == 0 && b->cloud.n == 0)
-		r = cloud_refuse(error, 0, "no points in it");
+		r = cloud_refuse(error, 0,
+		                 b->left_out ? "no points within 1000 km of its origin; shift the cloud there first"
+		                             : "no points in it");
 	if (r < 0)
 		cloud_finish(&b->cloud);
 	else

@@ -9,6 +9,7 @@
 struct cloud_builder {
 	struct cloud cloud;
 	size_t cap;
+	size_t left_out;
 };
 
 /* Points that are no numbers or farther than 1000 km are left out (drivers write NaN where nothing was seen).

@@ -112,6 +112,7 @@ static void lines_of_text_are_points(void **state)
 	expect_refused(xyz_read, "x y z\nx y z\n", 2, "x y z");
 	expect_refused(xyz_read, "", 0, "no points");
 	expect_refused(xyz_read, "7\nnan nan nan\n", 0, "no points");
+	expect_refused(xyz_read, "500000 5400000 300\n", 0, "shift"); /* metres of a national grid */
 }
 
 static void pcd_as_text_is_read_by_its_fields(void **state)

@@ -354,7 +354,7 @@ static void a_pose_of_fewer_numbers_is_refused(void **state)
 static void compare_with_profiles(const struct uos_scan *scan, struct text *csv)
 {
 	for (uint32_t i = 0; i < scan->rows; i++) {
-		double up_deg, mm;
+		double up_deg = 0, mm;
 		assert_true(text_skip_empty(csv) && text_number(csv, &up_deg));
 		assert_true(fabs(scan->row[i].tilt_rad + up_deg * TRIG_DEG) < 0.0002 * TRIG_DEG);
 		for (uint32_t k = 0; k < scan->row[i].n; k++) {

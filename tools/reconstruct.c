@@ -618,11 +618,16 @@ static void tell(const struct run *run)
 {
 	const struct figures *f = &run->figures;
 	struct grid_stats grid;
+	struct field_stats field;
 	grid_stats(map_grid(run->map), &grid);
+	field_stats(map_field(run->map), &field);
 	if (grid.refused_memory)
 		fprintf(stderr,
 		        "facet: the map is full (%zu MB): %llu times a block found no room; use a larger --cell\n",
 		        run->options.map.memory >> 20, (unsigned long long)grid.refused_memory);
+	if (field.far_points)
+		fprintf(stderr, "facet: %llu points lay too far from the map's origin; shift the cloud nearer to it\n",
+		        (unsigned long long)field.far_points);
 	if (f->faces == 0)
 		fprintf(stderr, "facet: no surface was found in %llu points; use a larger --cell\n",
 		        (unsigned long long)f->points);

@@ -12,6 +12,7 @@
 
 #include "tools/mesh_read.h"
 #include "tools/render.h"
+#include "tests/scarce.h"
 
 /* Two squares that look up: a large one on the floor, a small one above its middle; the third one looks down. */
 static const char table[] = "ply\r\nformat ascii 1.0\ncomment a table\nelement vertex 12\nproperty float x\n"
@@ -270,6 +271,45 @@ static void faces_that_cannot_be_are_refused(void **state)
 	}
 }
 
+static int read_and_draw(void)
+{
+	const struct render_view view = {.width = 20, .height = 15, .pitch_rad = 1, .cut_m = 2, .edges = true};
+	struct mesh mesh;
+	struct picture picture;
+	struct parse_error error;
+	struct buffer png = {0};
+	int status = mesh_read_ply((const uint8_t *)table, sizeof(table) - 1, &mesh, &error);
+	if (status)
+		return status;
+	status = render_mesh(&mesh, &view, &picture);
+	mesh_finish(&mesh);
+	if (status)
+		return status;
+	status = render_png(&picture, &png);
+	picture_finish(&picture);
+	buffer_finish(&png);
+	return status;
+}
+
+static void memory_that_runs_out_anywhere_leaves_nothing_behind(void **state)
+{
+	(void)state;
+	if (!SCARCE_WORKS)
+		skip();
+	int status = -ENOMEM;
+	long calls = 0;
+	for (; status != 0; calls++) {
+		const long live = scarce_live;
+		scarce_left = calls;
+		status = read_and_draw();
+		scarce_left = -1;
+		const long leaked = scarce_live - live;
+		assert_int_equal(leaked, 0);
+		assert_true(status == 0 || status == -ENOMEM);
+	}
+	assert_true(calls > 12);
+}
+
 int main(void)
 {
 	const struct CMUnitTest tests[] = {
@@ -286,6 +326,7 @@ int main(void)
 	    cmocka_unit_test(a_file_cut_anywhere_is_refused),
 	    cmocka_unit_test(bad_files_are_refused_with_line_and_reason),
 	    cmocka_unit_test(faces_that_cannot_be_are_refused),
+	    cmocka_unit_test(memory_that_runs_out_anywhere_leaves_nothing_behind),
 	};
 	return cmocka_run_group_tests(tests, NULL, NULL);
 }

@@ -13,9 +13,9 @@
  * FIONREAD on it tells what the reader has not yet taken. Bytes pass from master to slave by a kernel thread: directly after
  * a write there is nothing to see, so a profile of a paced scene counts as taken only after a few looks.
  *
- * A paced scene that became ready at t gets a profile at the first turn after t. Without the wire's pace the host still
- * reckons with it, and dates the profile a transfer too early: the profile then begins a transfer later, so that what
- * the host believes is still a time at which the scene was ready. */
+ * A paced scene that became ready at t must be ready, too, at the time to which its reader dates the profile. The reader may
+ * err by a turn of the mirror (arrivals tell it the mirror's phase, and a busy host delays them all), and without the
+ * wire's pace by the transfer it still reckons with: the profile begins at the first turn after t and both of these. */
 #include "tools/simulator.h"
 
 #include <errno.h>
@@ -252,7 +252,7 @@ static int64_t may_begin(struct sim_lms2xx *sim, int64_t now_ns)
 		sim->ready_ns = now_ns;
 	}
 	const size_t bytes = 2 * (size_t)(sim->fov_deg * 100 / sim->resolution_cdeg) + 14;
-	const int64_t from_ns = sim->ready_ns + (sim->fast ? transfer_ns(sim, bytes) : 0);
+	const int64_t from_ns = sim->ready_ns + LMS2XX_TURN_NS + (sim->fast ? transfer_ns(sim, bytes) : 0);
 	return from_ns > sim->free_ns ? from_ns : sim->free_ns;
 }
 

@@ -15,7 +15,8 @@ struct scene {
 	 * last beam has passed. A profile that the host breaks off is begun anew and asked for again. */
 	void (*scan)(void *ctx, struct profile *profile);
 	/* May a profile begin from t_ns (now) on? NULL: always. Asked every millisecond while streaming and not measuring, until it
-	 * says yes; the profile then begins with the next turn of the mirror. */
+	 * says yes; the profile then begins so much later that also what its
+	 * reader takes for its begin is later. */
 	bool (*ready)(void *ctx, int64_t t_ns);
 	/* The profile begun last was taken by its reader (nothing of it is left in the line). May be NULL. */
 	void (*taken)(void *ctx, int64_t t_ns);

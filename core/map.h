@@ -12,8 +12,8 @@ struct map_params {
 	double cell_m;
 	double tolerance; /* cells */
 	bool reduce;
-	int lookahead;    /* rows */
-	size_t memory;    /* bytes */
+	int lookahead; /* rows */
+	size_t memory; /* bytes */
 };
 
 struct map;

@@ -11,11 +11,11 @@
 
 struct model {
 	uint32_t nv, nt;
-	double (*vertex)[3];  /* m */
-	float (*normal)[3];   /* averaged over all faces of a point, area-weighted, unit length */
+	double (*vertex)[3]; /* m */
+	float (*normal)[3];  /* averaged over all faces of a point, area-weighted, unit length */
 	uint32_t (*triangle)[3];
-	int32_t *plane;       /* [nt] -1 none */
-	uint8_t *class;       /* [nt] */
+	int32_t *plane; /* [nt] -1 none */
+	uint8_t *class; /* [nt] */
 };
 
 /* Welds the living patches of a store, in key order: two vertices are one exactly where their lattice points are equal. 0 or -ENOMEM. */
@@ -35,7 +35,7 @@ void buffer_finish(struct buffer *);
 /* Writers: x y z as double in PLY (so that equal lattice points stay equal), nx ny nz as float, per face plane and class. */
 void ply_write(const struct model *, bool ascii, struct buffer *ret);
 void obj_write(const struct model *, struct buffer *ret);
-void stl_write(const struct model *, struct buffer *ret); /* binary */
+void stl_write(const struct model *, struct buffer *ret);  /* binary */
 void gltf_write(const struct model *, struct buffer *ret); /* .glb; z up turned to glTF's y up */
 
 /* Readers: parse a whole file in memory. On bad input they answer -EINVAL and one sentence without the file's name
@@ -52,8 +52,10 @@ struct cloud {
 };
 void cloud_finish(struct cloud *);
 int ply_read_cloud(const uint8_t *data, size_t len, struct cloud *ret, struct parse_error *error);
-int pcd_read(const uint8_t *data, size_t len, struct cloud *ret, struct parse_error *error); /* ascii, binary, binary_compressed */
-int xyz_read(const uint8_t *data, size_t len, struct cloud *ret, struct parse_error *error); /* .xyz; .pts with a count line */
+int pcd_read(const uint8_t *data, size_t len, struct cloud *ret,
+             struct parse_error *error); /* ascii, binary, binary_compressed */
+int xyz_read(const uint8_t *data, size_t len, struct cloud *ret,
+             struct parse_error *error); /* .xyz; .pts with a count line */
 
 /* uos .3d: rows of a raster where one can be recovered (else the file is a cloud). Ranges and bearings as the scanner
  * had them, so that the rows go the way of live ones; see uos.c for the frames. Ranges outside these limits keep their
@@ -64,12 +66,12 @@ int xyz_read(const uint8_t *data, size_t len, struct cloud *ret, struct parse_er
 struct uos_scan {
 	uint32_t rows;
 	struct uos_row {
-		double tilt_rad;              /* positive looks down */
-		double first_rad, step_rad;   /* 0 straight ahead, positive left */
+		double tilt_rad;            /* positive looks down */
+		double first_rad, step_rad; /* 0 straight ahead, positive left */
 		uint32_t n;
 		float *range_m;
-		uint8_t *state;               /* enum beam_state */
-	} *row;
+		uint8_t *state; /* enum beam_state */
+	} * row;
 	struct cloud cloud; /* filled instead when there is no raster; in the scanner's frame, m, x forward, z up */
 };
 int uos_read(const uint8_t *data, size_t len, struct uos_scan *ret, struct parse_error *error);

@@ -13,18 +13,18 @@ struct patch_run {
 	uint16_t triangles;
 };
 
-#define PLANE_NONE UINT32_MAX
+#define PLANE_NONE         UINT32_MAX
 #define PATCH_VERTICES_MAX 65535 /* fits u16 on the wire: a patch of 16^3 cells has at most 3 * 17^3 vertices */
 
 /* One piece of memory; reference-counted, so that results cross threads without copies. */
 struct patch {
 	atomic_uint references;
 	struct patch_key key;
-	uint64_t version;            /* the step that made it */
+	uint64_t version;              /* the step that made it */
 	int64_t t_first_ns, t_last_ns; /* of the rows that made it */
-	uint32_t nv, nt, nruns;      /* nt == 0: the patch is gone */
-	uint16_t (*vertex)[3];       /* lattice */
-	uint32_t (*triangle)[3];     /* ordered by run, each rotated to begin with its smallest index */
+	uint32_t nv, nt, nruns;        /* nt == 0: the patch is gone */
+	uint16_t (*vertex)[3];         /* lattice */
+	uint32_t (*triangle)[3];       /* ordered by run, each rotated to begin with its smallest index */
 	struct patch_run *run;
 };
 

@@ -6,15 +6,17 @@
  * Meshes are made when the queue is empty, so that a change is seen as soon as it can be, and at the latest after
  * WORKER_MESH_ROWS rows, so that under load many rows share one extraction but nobody waits for ever: extraction is
  * what is saved first, rows are refused last. Because a mesh is a function of the voxels alone, what was skipped leaves
- * no trace (law L2). The dirty set of a step goes to the loop as one result or not at all (law L4).
+ * no trace (law L2). The patches of a set are meshed by a crew of threads, the worker's own among them. The dirty set of a step goes to the loop as one result or not at all (law L4).
  *
- * The two threads share what `lock` guards and the progress counter, nothing else; patches cross by reference count. */
+ * Loop and worker share what `lock` guards, the progress counter and the wish to stop, nothing else; patches cross by reference count. */
 #include "daemon/worker.h"
 
 #include <assert.h>
 #include <pthread.h>
 #include <stdlib.h>
 #include <string.h>
+
+#include "daemon/crew.h"
 
 enum item_kind { ITEM_ROW, ITEM_FLUSH, ITEM_RESET };
 
@@ -33,6 +35,7 @@ struct worker {
 	pthread_mutex_t lock;
 	pthread_cond_t wake; /* the worker waits: for an item, or for room among the results */
 	atomic_uint_fast64_t progress;
+	atomic_bool stop;       /* set under `lock`, read without it between patches */
 	uint64_t progress_seen; /* the loop's */
 
 	/* Under `lock`. */
@@ -40,12 +43,12 @@ struct worker {
 	size_t first, items;
 	struct worker_result *oldest, **newest;
 	size_t results;
-	bool stop, idle;
+	bool idle;
 	struct worker_status status;
 
 	/* The worker's own. */
 	struct map *map;
-	struct mesher *mesher;
+	struct crew *crew;
 	struct worker_result *result; /* the one being made; arrivals gather here */
 	uint64_t published_step;
 	size_t rows_since_mesh;
@@ -56,16 +59,6 @@ struct worker {
 static void progress(struct worker *w)
 {
 	atomic_fetch_add_explicit(&w->progress, 1, memory_order_relaxed);
-}
-
-static bool stopping(struct worker *w)
-{
-	bool stop;
-
-	pthread_mutex_lock(&w->lock);
-	stop = w->stop;
-	pthread_mutex_unlock(&w->lock);
-	return stop;
 }
 
 /* False: stop. Sets *ret_more when another item waits already. */
@@ -120,25 +113,24 @@ static bool apply(struct worker *w, const struct item *item)
 	return false;
 }
 
+/* False when memory is out. A set that was cut short by `stop` has NULLs too, but is never looked at. */
 static bool mesh_dirty(struct worker *w, struct worker_result *result)
 {
-	const struct patch_key *key;
-	size_t n = map_take_dirty(w->map, &key);
+	struct crew_task task = {.map = w->map, .stop = &w->stop, .progress = &w->progress};
+	bool whole = true;
 
-	if (n == 0)
+	task.n = map_take_dirty(w->map, &task.key);
+	if (task.n == 0)
 		return true;
-	result->patch = calloc(n, sizeof(*result->patch));
-	result->faces_raw = calloc(n, sizeof(*result->faces_raw));
+	task.patch = result->patch = calloc(task.n, sizeof(*result->patch));
+	task.faces_raw = result->faces_raw = calloc(task.n, sizeof(*result->faces_raw));
 	if (!result->patch || !result->faces_raw)
 		return false;
-	for (size_t i = 0; i < n && !stopping(w); i++) {
-		result->patch[i] = map_mesh_patch(w->map, w->mesher, key[i], &result->faces_raw[i]);
-		if (!result->patch[i])
-			return false;
-		result->patches++;
-		progress(w);
-	}
-	return true;
+	result->patches = task.n;
+	crew_mesh(w->crew, &task);
+	for (size_t i = 0; i < task.n; i++)
+		whole &= result->patch[i] != NULL;
+	return whole || w->stop;
 }
 
 /* Waits for room: the loop is behind, and rows will pile up in the queue, which has a limit. */
@@ -167,7 +159,7 @@ static bool publish(struct worker *w)
 		return true;
 	if (!mesh_dirty(w, result))
 		return false;
-	if (stopping(w)) /* the set may be cut short */
+	if (w->stop) /* the set may be cut short */
 		return true;
 	w->result = calloc(1, sizeof(*w->result));
 	if (!w->result) {
@@ -213,12 +205,12 @@ static struct worker *worker_allocate(const struct worker_params *params)
 		return NULL;
 	w->params = *params;
 	w->newest = &w->oldest;
-	w->mesher = mesher_create();
+	w->crew = crew_create(params->threads);
 	w->result = calloc(1, sizeof(*w->result));
-	if (w->mesher && w->result && begin_map(w))
+	if (w->crew && w->result && begin_map(w))
 		return w;
 	map_destroy(w->map);
-	mesher_destroy(w->mesher);
+	crew_destroy(w->crew);
 	free(w->result);
 	free(w);
 	return NULL;
@@ -237,7 +229,7 @@ static void worker_free(struct worker *w)
 	}
 	worker_result_destroy(w->result);
 	map_destroy(w->map);
-	mesher_destroy(w->mesher);
+	crew_destroy(w->crew);
 	pthread_cond_destroy(&w->wake);
 	pthread_mutex_destroy(&w->lock);
 	free(w);

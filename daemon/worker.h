@@ -13,6 +13,7 @@
 
 struct worker_params {
 	struct map_params map;
+	int threads;              /* that mesh, the worker's own included; 0: see crew.h */
 	void (*ready)(void *ctx); /* called by the worker's thread: a result waits (or the worker failed) */
 	void *ctx;
 };

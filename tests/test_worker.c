@@ -209,8 +209,8 @@ static struct worker_result *wait_result(struct worker *worker)
 
 static struct worker *start(int lookahead)
 {
-	struct worker_params params = {.map = {.cell_m = 0.05, .lookahead = lookahead, .memory = 1 << 20},
-	                               .ready = on_ready};
+	struct worker_params params = {
+	    .map = {.cell_m = 0.05, .lookahead = lookahead, .memory = 1 << 20}, .ready = on_ready, .threads = 3};
 	struct worker *worker;
 
 	readies = 0;

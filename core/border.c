@@ -389,7 +389,7 @@ static uint32_t enter_vertex(uint32_t v, uint32_t name, uint32_t (*vertex)[NODES
 int border_find(const struct window *window, const struct surface *raw, int64_t tolerance, struct arena *arena,
                 struct border *ret)
 {
-	assert(raw->name && tolerance >= 0);
+	assert((raw->name || !raw->nv) && tolerance >= 0);
 	struct border border = {0};
 	uint32_t(*vertex)[NODES] = arena_alloc(arena, 6, sizeof *vertex);
 	struct face *face = ARENA_NEW(arena, struct face, 1);

@@ -5,12 +5,6 @@
 #include "core/reduce.h"
 #include "core/simplify.h"
 
-/* A plane: normal * p + offset = 0, lattice units, unit normal. */
-struct region_plane {
-	struct vec3 normal;
-	double offset;
-};
-
 /* Finds the planar regions and numbers their triangles in s->plane, their planes in s->region; what lies within a region
  * goes, its outline stays. A region that cannot be triangulated so stays as it is. 0 or -ENOMEM. */
 int region_flatten(struct simplify *s, struct arena *arena, struct reduce_stats *stats);

@@ -407,6 +407,21 @@ static uint32_t take_rim(struct simplify *s, uint32_t v, uint32_t h, uint32_t ot
 	return list;
 }
 
+/* A triangle that got a corner off its plane has none any more. */
+static void leave_planes(const struct pass *pass, uint32_t u)
+{
+	const struct simplify *s = pass->s;
+	for (uint32_t f = 0; f < pass->flats; f++) {
+		uint32_t *number = &s->plane[pass->flat_triangle[f]];
+		if (*number == UINT32_MAX)
+			continue;
+		const struct region_plane *plane = &s->region[*number];
+		double height = vec3_dot(plane->normal, simplify_place(s, u)) + plane->offset;
+		if (height * height > s->tolerance_squared)
+			*number = UINT32_MAX;
+	}
+}
+
 static void commit(struct pass *pass, uint32_t v, uint32_t u, uint32_t h, bool rim)
 {
 	struct simplify *s = pass->s;
@@ -427,6 +442,7 @@ static void commit(struct pass *pass, uint32_t v, uint32_t u, uint32_t h, bool r
 	follow_rims(s, h);
 	if (g != HALFEDGE_NONE)
 		follow_rims(s, g);
+	leave_planes(pass, u);
 	quadric_add(&s->quadric[u], &s->quadric[v]);
 	note_own(pass, u);
 	halfedge_collapse(mesh, h, v);

@@ -12,7 +12,11 @@
 #include "core/nearby.h"
 #include "core/quadric.h"
 
-struct region_plane;
+/* A plane: normal * p + offset = 0, lattice units, unit normal. */
+struct region_plane {
+	struct vec3 normal;
+	double offset;
+};
 
 struct simplify {
 	struct halfedge_mesh mesh;

@@ -8,12 +8,13 @@
 #include <stddef.h>
 #include <string.h>
 
-#define WHERE(type, member) .offset = offsetof(type, member), .size = sizeof(((type *)0)->member)
-#define CONFIG(member)      WHERE(struct config, member)
-#define DEVICE(member)      WHERE(struct config_device, member)
-#define REGISTER_(member)   WHERE(struct config_register, member)
-#define DEG(x)              ((x)*0.017453292519943295)
-#define MEGA                1048576.0
+#define CONFIG(member) .offset = offsetof(struct config, member), .size = sizeof(((struct config *)0)->member)
+#define DEVICE(member) \
+	.offset = offsetof(struct config_device, member), .size = sizeof(((struct config_device *)0)->member)
+#define REGISTER_(member) \
+	.offset = offsetof(struct config_register, member), .size = sizeof(((struct config_register *)0)->member)
+#define DEG(x) ((x)*0.017453292519943295)
+#define MEGA   1048576.0
 
 /* clang-format off */
 const struct key key_table[] = {

@@ -18,6 +18,7 @@ size_t framer_push(struct framer *f, const uint8_t *bytes, size_t len)
 	if (f->begin > 0) {
 		memmove(f->buf, f->buf + f->begin, f->end - f->begin);
 		f->end -= f->begin;
+		f->silence -= f->silence < f->begin ? f->silence : f->begin;
 		f->begin = 0;
 	}
 	const size_t room = sizeof f->buf - f->end;
@@ -35,7 +36,7 @@ static void framer_refuse(struct framer *f, int reason)
 	f->refused[reason]++;
 	f->skipped++;
 	f->begin++;
-	f->boundary = false;
+	f->boundary = f->begin == f->silence;
 }
 
 size_t framer_take(struct framer *f, const uint8_t **ret_telegram)
@@ -50,17 +51,17 @@ size_t framer_take(struct framer *f, const uint8_t **ret_telegram)
 			f->boundary = true;
 			return (size_t)r;
 		}
-		if (r == FRAMER_MORE && !f->silent && len < sizeof f->buf)
+		const bool hopeless = f->begin < f->silence || len == sizeof f->buf;
+		if (r == FRAMER_MORE && !hopeless)
 			return 0;
 		framer_refuse(f, r == FRAMER_MORE ? FRAMER_CUT : -r);
 	}
-	if (f->silent)
-		f->boundary = true;
-	f->silent = false;
 	return 0;
 }
 
 void framer_silence(struct framer *f)
 {
-	f->silent = true;
+	f->silence = f->end;
+	if (f->begin == f->end)
+		f->boundary = true;
 }

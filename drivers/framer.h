@@ -34,7 +34,8 @@ struct framer {
 	uint64_t refused[FRAMER_REASONS]; /* by reason */
 	uint64_t skipped;                 /* bytes that belong to no telegram */
 	size_t begin, end;                /* what of buf is not yet judged */
-	bool boundary, silent;
+	size_t silence;                   /* end of what came before the last silence, 0: none is left of it */
+	bool boundary;
 	uint8_t buf[FRAMER_CAPACITY];
 };
 
@@ -46,9 +47,9 @@ size_t framer_push(struct framer *, const uint8_t *bytes, size_t len);
 /* The next telegram's length, or 0: push more. The telegram is borrowed until the next call. */
 size_t framer_take(struct framer *, const uint8_t **ret_telegram);
 
-/* Nothing came for so long that what waits for its end never gets it: framer_take now refuses it, and hands out what
- * stands whole behind a false start. Takes effect on the bytes pushed so far: call framer_take until 0 before the next
- * push. */
+/* Nothing came for long; what is pushed from here on came after a silence. A telegram that was begun before is still taken when
+ * these bytes make it whole (it was the host that slept), else it is refused, so that what stands behind it is not
+ * held up; the silence is a boundary, too. */
 void framer_silence(struct framer *);
 
 #endif

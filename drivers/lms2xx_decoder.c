@@ -347,10 +347,8 @@ void lms2xx_decode(struct decoder *d, const struct record *record, const struct 
 {
 	const enum direction direction = record->direction == TO_DEVICE ? TO_DEVICE : FROM_DEVICE;
 	struct framer *framer = &d->framer[direction];
-	if (record->t_ns - d->heard_ns[direction] > LMS2XX_STALE_NS) {
+	if (record->t_ns - d->heard_ns[direction] > LMS2XX_STALE_NS)
 		framer_silence(framer);
-		drain(d, direction, d->heard_ns[direction], sink); /* it came whole then, behind a false start */
-	}
 	d->heard_ns[direction] = record->t_ns;
 	for (size_t done = 0; done < record->len;) {
 		done += framer_push(framer, record->bytes + done, record->len - done);

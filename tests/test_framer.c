@@ -104,38 +104,42 @@ static void a_bare_byte_counts_at_a_boundary_only(void **state)
 	assert_int_equal(f.skipped, 2);
 }
 
-static void silence_ends_what_was_begun_and_opens_a_boundary(void **state)
+static void silence_ends_what_was_begun_and_is_a_boundary(void **state)
 {
 	(void)state;
 	struct framer f;
 	char out[64];
-	const uint8_t *telegram;
 	framer_init(&f, scan_toy, NULL);
 	collect(&f, (const uint8_t *)"<\11<\1aa", 6, 6, out);
 	assert_string_equal(out, "");
 	framer_silence(&f);
-	assert_int_equal(framer_take(&f, &telegram), 4);
-	assert_memory_equal(telegram, "<\1aa", 4);
-	assert_int_equal(framer_take(&f, &telegram), 0);
+	collect(&f, (const uint8_t *)"!<\3", 3, 3, out);
+	assert_string_equal(out, "<\1aa|!|");
 	assert_int_equal(f.refused[FRAMER_CUT], 1);
-	collect(&f, (const uint8_t *)"x", 1, 1, out);
+	collect(&f, (const uint8_t *)"abc\46x", 5, 1, out);
+	assert_string_equal(out, "<\3abc\46|");
 	framer_silence(&f);
-	assert_int_equal(framer_take(&f, &telegram), 0);
 	collect(&f, (const uint8_t *)"!", 1, 1, out);
 	assert_string_equal(out, "!|");
+	assert_int_equal(f.skipped, 3);
 }
 
-static void silence_lasts_for_what_was_there_only(void **state)
+static void a_telegram_that_the_host_slept_in_is_taken(void **state)
 {
 	(void)state;
-	struct framer f;
 	char out[64];
-	const uint8_t *telegram;
-	framer_init(&f, scan_toy, NULL);
-	framer_silence(&f);
-	assert_int_equal(framer_take(&f, &telegram), 0);
-	collect(&f, (const uint8_t *)"<\1aa", 4, 1, out);
-	assert_string_equal(out, "<\1aa|");
+	for (size_t cut = 1; cut < 6; cut++) {
+		struct framer f;
+		framer_init(&f, scan_toy, NULL);
+		collect(&f, (const uint8_t *)"!<\2ab\303", cut, cut, out);
+		framer_silence(&f);
+		collect(&f, (const uint8_t *)"!<\2ab\303" + cut, 6 - cut, 6, out);
+		assert_string_equal(out, "<\2ab\303|");
+		assert_int_equal(f.skipped, 0);
+		framer_silence(&f);
+		collect(&f, (const uint8_t *)"<\1aa", 4, 1, out); /* a silence with nothing before it cuts nothing */
+		assert_string_equal(out, "<\1aa|");
+	}
 }
 
 static void a_scan_that_never_has_enough_does_not_fill_memory(void **state)
@@ -162,8 +166,8 @@ int main(void)
 	    cmocka_unit_test(garbage_costs_a_byte_each_and_is_counted),
 	    cmocka_unit_test(a_telegram_inside_a_false_start_is_found),
 	    cmocka_unit_test(a_bare_byte_counts_at_a_boundary_only),
-	    cmocka_unit_test(silence_ends_what_was_begun_and_opens_a_boundary),
-	    cmocka_unit_test(silence_lasts_for_what_was_there_only),
+	    cmocka_unit_test(silence_ends_what_was_begun_and_is_a_boundary),
+	    cmocka_unit_test(a_telegram_that_the_host_slept_in_is_taken),
 	    cmocka_unit_test(a_scan_that_never_has_enough_does_not_fill_memory),
 	};
 	return cmocka_run_group_tests(tests, NULL, NULL);

@@ -10,8 +10,7 @@
  * and scans that end while the wire is busy are skipped, as the scanner does.
  *
  * The slave is held open here too. So the line outlives its reader (who may close and open it again), it stays raw, and
- * FIONREAD on it tells what the reader has not yet taken. Bytes pass from master to slave by a kernel thread: directly after
- * a write there is nothing to see, so a profile of a paced scene counts as taken only after a few looks.
+ * polling it tells whether the reader has taken everything.
  *
  * A paced scene that became ready at t must be ready, too, at the time to which its reader dates the profile. The reader may
  * err by a turn of the mirror (arrivals tell it the mirror's phase, and a busy host delays them all), and without the
@@ -20,10 +19,10 @@
 
 #include <errno.h>
 #include <fcntl.h>
+#include <poll.h>
 #include <stdio.h>
 #include <stdlib.h>
 #include <string.h>
-#include <sys/ioctl.h>
 #include <sys/stat.h>
 #include <termios.h>
 #include <unistd.h>
@@ -32,7 +31,7 @@
 #include "drivers/lms2xx_wire.h"
 #include "drivers/serial.h"
 
-enum { STATUS_OK = 0x10, QUEUE = 8192, STALE_NS = 20000000, TICK_MS = 1, SURE_TICKS = 2, UNSURE_TICKS = 6 };
+enum { STATUS_OK = 0x10, QUEUE = 8192, STALE_NS = 20000000, TICK_MS = 1 };
 
 struct sim_lms2xx {
 	uv_poll_t poll;
@@ -69,9 +68,7 @@ struct sim_lms2xx {
 	size_t len, sent;
 	int64_t wire_end_ns; /* when its last byte has left at the wire's pace */
 	uint8_t garble;
-	bool awaited;    /* a profile is on its way to the reader ... */
-	bool seen;       /* ... and was seen in the line */
-	int empty_ticks; /* looks at the line running that found nothing of it */
+	bool awaited; /* a profile is on its way to the reader */
 };
 
 /* The wire */
@@ -132,19 +129,12 @@ static void pump(struct sim_lms2xx *sim, int64_t now_ns)
 	}
 }
 
-/* Looks once a tick. Bytes that were seen in the line and are gone were taken; where none were seen the reader may have
- * been quicker than the tick, or the kernel's thread is slow: that takes longer to believe. */
+/* poll waits for the kernel's thread that passes the bytes on (which a busy machine starves for seconds); FIONREAD does not, and
+ * sees nothing directly after a write. */
 static void watch_reader(struct sim_lms2xx *sim, int64_t now_ns)
 {
-	int waiting = 0;
-	if (!sim->awaited)
-		return;
-	if (sim->len > 0 || ioctl(sim->slave, FIONREAD, &waiting) < 0 || waiting > 0) {
-		sim->seen = sim->seen || waiting > 0;
-		sim->empty_ticks = 0;
-		return;
-	}
-	if (++sim->empty_ticks < (sim->seen ? SURE_TICKS : UNSURE_TICKS))
+	struct pollfd line = {.fd = sim->slave, .events = POLLIN};
+	if (!sim->awaited || sim->len > 0 || poll(&line, 1, 0) != 0)
 		return;
 	sim->awaited = false;
 	sim->scene.taken(sim->scene.ctx, now_ns);
@@ -232,8 +222,6 @@ static void end_scan(struct sim_lms2xx *sim)
 	sim->part = (sim->part + 1) & 3;
 	enqueue(sim, telegram, len, end_ns);
 	sim->awaited = sim->scene.taken != NULL;
-	sim->seen = false;
-	sim->empty_ticks = 0;
 }
 
 static bool wants_scan(const struct sim_lms2xx *sim)
@@ -461,11 +449,8 @@ static void listen_to(struct sim_lms2xx *sim, const uint8_t *bytes, size_t len, 
 {
 	const uint8_t *telegram;
 	size_t n;
-	if (now_ns - sim->heard_ns > STALE_NS) {
+	if (now_ns - sim->heard_ns > STALE_NS)
 		framer_silence(&sim->framer);
-		while (framer_take(&sim->framer, &telegram) > 0)
-			;
-	}
 	sim->heard_ns = now_ns;
 	const uint64_t bad = sim->framer.refused[LMS2XX_BAD_CRC];
 	for (size_t done = 0; done < len;) {

@@ -252,7 +252,7 @@ static int decode_hello(const uint8_t *p, size_t len, struct native_hello *ret, 
 	hello.step = get_u64(p + 32);
 	hello.t_ns = (int64_t)get_u64(p + 40);
 	if (hello.major != NATIVE_MAJOR) {
-		snprintf(error, 128, "the peer speaks version %u of the protocol, this program version %u", hello.major,
+		snprintf(error, 128, "the peer speaks version %u of the protocol, this program version %d", hello.major,
 		         NATIVE_MAJOR);
 		return -EPROTO;
 	}

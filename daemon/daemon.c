@@ -70,6 +70,9 @@ struct daemon {
 	/* For the status. */
 	bool paused;
 	uint64_t queue_full, rows_paused;
+	uint64_t overload_begin; /* queue_full when the worker fell behind; it still does while `overloaded` */
+	uint64_t queue_full_seen;
+	bool overloaded, memory_full;
 	uint8_t map_id[16];
 	double latency_ms[LATENCIES];
 	uint64_t latencies;
@@ -434,6 +437,29 @@ static void log_server(void *ctx, int priority, const char *text)
 
 /* Once a second */
 
+/* Limits are told when they are reached and when they are left, not once a row. */
+static void log_limits(struct daemon *d)
+{
+	bool behind = d->queue_full != d->queue_full_seen;
+	bool full = d->grid.refused_memory > 0;
+
+	if (behind && !d->overloaded) {
+		d->overload_begin = d->queue_full_seen;
+		log_line(LOG_WARNING,
+		         "the machine cannot keep up: rows are not applied; use a larger map.cell or fewer scanners");
+	}
+	if (!behind && d->overloaded)
+		log_line(LOG_INFO, "keeps up again; %llu rows were not applied",
+		         (unsigned long long)(d->queue_full - d->overload_begin));
+	if (full && !d->memory_full)
+		log_line(
+		    LOG_WARNING,
+		    "the map has reached map.memory: what is new is left out; allow more, or use a larger map.cell");
+	d->overloaded = behind;
+	d->queue_full_seen = d->queue_full;
+	d->memory_full = full;
+}
+
 static void on_second(uv_timer_t *timer)
 {
 	struct daemon *d = timer->data;
@@ -442,6 +468,7 @@ static void on_second(uv_timer_t *timer)
 
 	pipeline_stats(d->pipeline, &rows);
 	d->rows[column] = rows.rows;
+	log_limits(d);
 	for (int i = 0; i < d->config->devices; i++)
 		d->decoded[column][i] = supervisor_device(d->supervisor, i)->decoded;
 	if (d->journal && !d->journal_failed && journal_error(d->journal) < 0) {

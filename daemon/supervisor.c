@@ -283,9 +283,10 @@ static bool read_line(struct supervisor *s, struct line *line, int64_t t_ns)
 
 void supervisor_ready(struct supervisor *s, int device, bool readable, bool writable, int64_t t_ns)
 {
-	struct line *line = &s->line[device];
+	struct line *line;
 
 	assert(device >= 0 && device < s->config->devices);
+	line = &s->line[device];
 	if (!line->link)
 		return;
 	if (writable && line->unwritten_len > 0 && !write_owed(s, line, t_ns))

@@ -149,8 +149,9 @@ static void put_clients(FILE *out, json_t *status)
 	fprintf(out, "clients    %zu\n", json_array_size(member(status, "clients")));
 	json_array_foreach(member(status, "clients"), i, client)
 	{
-		fprintf(out, "  %-8.16s %-20.40s step %s", string(client, "kind"), string(client, "address"),
-		        grouped(number(client, "step")));
+		fprintf(out, "  %-8.16s %.80s", string(client, "kind"), string(client, "address"));
+		if (strcmp(string(client, "kind"), "native") == 0)
+			fprintf(out, ", step %s", grouped(number(client, "step")));
 		if (number(client, "behind") > 0)
 			fprintf(out, ", %s behind", grouped(number(client, "behind")));
 		if (number(client, "aborts") > 0)

@@ -13,6 +13,7 @@
 #include <netinet/in.h>
 #include <poll.h>
 #include <pthread.h>
+#include <stdatomic.h>
 #include <stdio.h>
 #include <stdlib.h>
 #include <string.h>
@@ -860,7 +861,7 @@ static void a_line_in_use_is_left_alone(void **state)
 struct late_peer {
 	int master;
 	modbus_t *modbus;
-	volatile bool stop;
+	atomic_bool stop;
 };
 
 static void *late_peer_thread(void *arg)

@@ -196,6 +196,7 @@ static bool serve(struct sim_servo *s)
 {
 	uint8_t request[MODBUS_TCP_MAX_ADU_LENGTH];
 	int n = modbus_receive(s->modbus, request), header = modbus_get_header_length(s->modbus);
+	int64_t t_ns;
 
 	if (n < 0)
 		return errno == EMBBADCRC || errno == ETIMEDOUT || errno == EMBBADDATA;
@@ -205,10 +206,11 @@ static bool serve(struct sim_servo *s)
 	if (s->port && request[header - 1] != s->slave && request[header - 1] != MODBUS_TCP_SLAVE)
 		return true;
 	pthread_mutex_lock(&s->lock);
-	judge_last_answer(s, now_ns());
-	fill_registers(s, now_ns());
+	t_ns = now_ns(); /* what a write asks for begins before its answer is seen */
+	judge_last_answer(s, t_ns);
+	fill_registers(s, t_ns);
 	n = modbus_reply(s->modbus, request, n, s->map);
-	take_registers(s, now_ns());
+	take_registers(s, t_ns);
 	s->pending = n >= 0 && reads_position(request + header);
 	s->answered_ns = now_ns();
 	pthread_mutex_unlock(&s->lock);

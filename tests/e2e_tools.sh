@@ -88,6 +88,79 @@ assert {d["name"] for d in status["devices"]} >= {"laser", "servo"}, status' || 
 timeout 20 "$facet" watch "$address" | head -n 2 >"$scratch/lines"
 [ "$(grep -c '^step [0-9]' "$scratch/lines")" -eq 2 ] || fail "facet watch in a pipe: $(cat "$scratch/lines")"
 
+# The document of the protocol is enough to write a client: this one, from its tables, holds the same map as facet save.
+cat >"$scratch/client.py" <<'EOF'
+import json, socket, struct, sys, time
+
+def connect():
+    s = socket.socket(socket.AF_UNIX)
+    s.settimeout(60)
+    s.connect(sys.argv[1])
+    return s.makefile("rwb")
+
+def ask(stream, line):
+    stream.write(line.encode() + b"\n")
+    stream.flush()
+    return json.loads(stream.readline())
+
+def frames(stream):
+    while True:
+        length, kind, flags, zero = struct.unpack("<IBBH", stream.read(8))
+        assert flags == 0 and zero == 0 and 4 <= length <= (16 << 20) - 4
+        yield kind, stream.read(length - 4)
+
+def read_patch(data):
+    x, y, z, version, first, last, nv, nt, nr = struct.unpack_from("<3iQqqHHH", data)
+    assert first <= last and nv >= 3 and nt and nr
+    at = 42
+    vertices = [v for v in struct.iter_unpack("<3H", data[at:at + 6 * nv])]
+    assert all(c <= 4096 for v in vertices for c in v)
+    at += 6 * nv
+    assert sum(run[2] for run in struct.iter_unpack("<IBH", data[at:at + 7 * nr])) == nt
+    at += 7 * nr
+    triangles = list(struct.iter_unpack("<3B" if nv <= 256 else "<3H", data[at:]))
+    assert len(triangles) == nt and all(i < nv for t in triangles for i in t)
+    return (x, y, z), [tuple(4096 * k + c for k, c in zip((x, y, z), v)) for v in vertices], triangles, version
+
+def read_map():
+    stream = connect()
+    stream.write(struct.pack("<IBBHB3xI6f", 36, 2, 0, 0, 0, 0, *[0.0] * 6))
+    stream.flush()
+    patches, announced, step = {}, None, None
+    for kind, data in frames(stream):
+        if kind == 1:
+            major, minor, map_id, generation, cell, hello_step, t = struct.unpack("<HH16sIdQq", data)
+            assert (major, minor) == (1, 0) and cell == 0.05 and generation == 1 and abs(t / 1e9 - time.time()) < 60
+        elif kind == 3:
+            step, count, removals, reset = struct.unpack("<QIIB", data)
+            assert reset == 1 and removals == 0
+        elif kind == 4:
+            key, vertices, triangles, version = read_patch(data)
+            assert key not in patches and version <= step
+            patches[key] = vertices, triangles
+        elif kind == 8:
+            assert struct.unpack("<Q", data)[0] == step and len(patches) == count
+            return step, len({v for vs, _ in patches.values() for v in vs}), sum(len(t) for _, t in patches.values())
+
+lines = connect()
+assert ask(lines, "?PAUSE")["class"] == "VERSION"
+assert json.loads(lines.readline()) == {"class": "OK", "command": "PAUSE"}
+assert ask(lines, "?NONSENSE")["class"] == "ERROR"
+assert ask(lines, '?WATCH={"enable":false}') == {"class": "WATCH", "enable": False}
+status = ask(lines, "?STATUS;")
+assert status["paused"] is True
+before = None
+while before != (now := read_map()):
+    before = now
+    time.sleep(0.5)
+print("step %d, %d vertices, %d faces" % now)
+EOF
+python3 "$scratch/client.py" "${address#unix:}" >"$scratch/documented" || fail "a client written from docs/protocol.md"
+"$facet" save "$address" -o "$scratch/paused.ply" >"$scratch/out" || fail "facet save of a paused map"
+grep -qF "$(cat "$scratch/documented")" "$scratch/out" ||
+    fail "a client written from docs/protocol.md holds $(cat "$scratch/documented"), facet save $(cat "$scratch/out")"
+echo "note: a client written from the document holds $(cat "$scratch/documented")"
+
 # A daemon that goes away is said once, and watched again when it is back.
 timeout 60 "$facet" watch "$address" >"$scratch/lines" 2>"$scratch/err" &
 watch=$!

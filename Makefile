@@ -45,12 +45,13 @@ DRIVERS := $(wildcard drivers/*.c)
 DAEMON := $(filter-out daemon/facetd.c,$(wildcard daemon/*.c))
 TOOLS := $(filter-out tools/facet.c,$(wildcard tools/*.c))
 TESTS := $(patsubst tests/%.c,%,$(wildcard tests/test_*.c))
+PROGRAMS := clients steps
 FUZZ := $(patsubst tests/%.c,%,$(wildcard tests/fuzz_*.c))
 LIBRARIES := $(B)/libtools.a $(B)/libdaemon.a $(B)/libdrivers.a $(B)/libconfig.a $(B)/libcore.a
 
 .PHONY: all tests check demo bench soak fuzz lint format deps install clean help run-check run-demo needed
 all: needed $(B)/facetd $(B)/facet
-tests: needed $(addprefix $(B)/tests/,$(TESTS))
+tests: needed $(addprefix $(B)/tests/,$(TESTS) $(PROGRAMS))
 
 help:
 	@echo 'make [config=release|debug|sanitize|thread]   build/facetd and build/facet'
@@ -84,6 +85,9 @@ $(B)/facet: $(B)/obj/tools/facet.o $(LIBRARIES)
 $(B)/tests/test_%: $(B)/obj/tests/test_%.o $(LIBRARIES)
 	@mkdir -p $(@D)
 	$(CC) $(LDFLAGS_ALL) -o $@ $^ $(LIBS) -lcmocka
+$(addprefix $(B)/tests/,$(PROGRAMS)): $(B)/tests/%: $(B)/obj/tests/%.o $(LIBRARIES)
+	@mkdir -p $(@D)
+	$(CC) $(LDFLAGS_ALL) -o $@ $^ $(LIBS)
 $(B)/tests/fuzz_%: $(B)/obj/tests/fuzz_%.o $(LIBRARIES)
 	@mkdir -p $(@D)
 	$(CC) $(LDFLAGS_ALL) -fsanitize=fuzzer -o $@ $^ $(LIBS)

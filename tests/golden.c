@@ -11,7 +11,7 @@
 #include "core/sweep.h"
 #include "core/trig.h"
 
-#define BEAMS 361
+#define BEAMS   361
 #define TURN_NS 13333333
 
 struct run {
@@ -52,7 +52,8 @@ static double cast_column(struct vec3 o, struct vec3 d)
 	return s > 0 ? s : 1e9;
 }
 
-static void measure(struct profile *p, const struct sweep_params *params, double tilt_rad, const struct pose *pose, uint32_t *noise)
+static void measure(struct profile *p, const struct sweep_params *params, double tilt_rad, const struct pose *pose,
+                    uint32_t *noise)
 {
 	struct transform base = transform_quat(pose->position_m, pose->rotation), tilt = transform_tilt(tilt_rad);
 	struct transform a = transform_compose(&base, &params->base_tilt), b = transform_compose(&a, &tilt);
@@ -93,8 +94,14 @@ static void drive(struct run *run, const struct sweep_params *params)
 		struct pose pose = {t, {i * 0.001, 0, 0}, quat_normalise((struct quat){1, 0, 0, i * 0.0002})};
 		sweep_tilt(run->sweep, &(struct tilt){t, tilt_rad});
 		sweep_pose(run->sweep, &pose);
-		p = (struct profile){.t_ns = t, .beam_ns = 37037, .turn_ns = TURN_NS, .interlace = 2, .parts = 1, .n = BEAMS,
-		                     .first_rad = -90 * TRIG_DEG, .step_rad = 0.5 * TRIG_DEG};
+		p = (struct profile){.t_ns = t,
+		                     .beam_ns = 37037,
+		                     .turn_ns = TURN_NS,
+		                     .interlace = 2,
+		                     .parts = 1,
+		                     .n = BEAMS,
+		                     .first_rad = -90 * TRIG_DEG,
+		                     .step_rad = 0.5 * TRIG_DEG};
 		measure(&p, params, tilt_rad, &pose, &noise);
 		sweep_profile(run->sweep, &p, t + 2 * TURN_NS);
 		drain(run, t, false);
@@ -116,8 +123,14 @@ static int play(struct run *run, const char *path)
 	for (uint32_t i = 0; i < scan.rows; i++) {
 		const struct uos_row *r = &scan.row[i];
 		int64_t t = (int64_t)i * 4 * TURN_NS;
-		p = (struct profile){.t_ns = t, .beam_ns = 37037, .turn_ns = TURN_NS, .interlace = 2, .parts = 1,
-		                     .n = (uint16_t)r->n, .first_rad = r->first_rad, .step_rad = r->step_rad};
+		p = (struct profile){.t_ns = t,
+		                     .beam_ns = 37037,
+		                     .turn_ns = TURN_NS,
+		                     .interlace = 2,
+		                     .parts = 1,
+		                     .n = (uint16_t)r->n,
+		                     .first_rad = r->first_rad,
+		                     .step_rad = r->step_rad};
 		memcpy(p.range_m, r->range_m, r->n * sizeof(float));
 		memcpy(p.state, r->state, r->n);
 		sweep_tilt(run->sweep, &(struct tilt){t - TURN_NS / 4, r->tilt_rad});
@@ -131,10 +144,13 @@ static int play(struct run *run, const char *path)
 
 int main(int argc, char **argv)
 {
-	struct map_params map_params = {.cell_m = 0.05, .tolerance = 0.25, .reduce = true, .lookahead = 2, .memory = 256 << 20};
+	struct map_params map_params = {
+	    .cell_m = 0.05, .tolerance = 0.25, .reduce = true, .lookahead = 2, .memory = 256 << 20};
 	struct sweep_params params = {.base_tilt = transform_rpy((struct vec3){0.2, 0, 0.1}, (struct vec3){0, 0.01, 0}),
 	                              .tilt_laser = transform_rpy((struct vec3){0, 0, 0.05}, (struct vec3){0, 0, 0}),
-	                              .range_min_m = 0.3, .range_max_m = 30, .hold_ns = 30000000};
+	                              .range_min_m = 0.3,
+	                              .range_max_m = 30,
+	                              .hold_ns = 30000000};
 	if (argc > 1) {
 		params.base_tilt = params.tilt_laser = params.map_base = transform_identity();
 		params.fixed_pose = true;

@@ -1,6 +1,6 @@
 /* Feeds a kept journal into the pipeline without sockets (law L7).
  *
- *   steps CONFIG JOURNAL OUT.ply           the map at the end, meshed every seven steps on the way; prints its hash and step
+ *   steps CONFIG JOURNAL OUT.ply           the map at the end, meshed every seven steps on the way; prints its hash and counts
  *   steps CONFIG JOURNAL DIR STEP...       writes DIR/STEP.raw.ply, the mesh before the reduction, at each of the steps
  *                                          (ascending) */
 #include <stdio.h>
@@ -119,7 +119,9 @@ int main(int argc, char **argv)
 	if (argc == 4)
 		write_mesh(&s, argv[3]);
 	patch_store_hash(s.store, hash);
-	printf("%s %llu\n", hash, (unsigned long long)map_step(s.map));
+	struct pipeline_stats stats;
+	pipeline_stats(p, &stats);
+	printf("%s %llu profiles %llu steps\n", hash, (unsigned long long)stats.sweep.profiles, (unsigned long long)map_step(s.map));
 	pipeline_destroy(p);
 	return 0;
 }

@@ -1,0 +1,69 @@
+"""Judges every mesh that a client held in tests/e2e_clients.sh against the raw mesh of its step, made from the kept list.
+
+    python3 tests/judge_steps.py BUILD DIR
+"""
+import concurrent.futures
+import glob
+import json
+import os
+import subprocess
+import sys
+
+from judge import SOUND, ask, broken
+
+CELL_M = 0.05
+BUFFERS, BUFFER_BYTES = 20, 16384
+
+
+def raw_meshes(build, out, steps):
+    subprocess.run([f"{build}/tests/steps", f"{out}/config.yaml", f"{out}/journal", f"{out}/held", *map(str, steps)],
+                   check=True, stdout=subprocess.DEVNULL)
+
+
+def judged(out, step):
+    mesh, raw = f"{out}/held/{step}.ply", f"{out}/held/{step}.raw.ply"
+    with open(raw, "rb") as f:
+        head = f.read(2000).split(b"end_header")[0].decode("ascii")
+    faces_raw = int(head.split("element face ")[1].split()[0])
+    if not faces_raw:
+        return step, 0, []
+    answer = ask([mesh, "--ref", raw, "--tol", "0.03", "--samples", "20000"])
+    claims = [*SOUND, "new_open_m==0"]
+    if answer["faces"]:
+        claims += [f"{way}.max<={CELL_M}" for way in ("to_ref", "from_ref")]
+        if faces_raw >= 10000:
+            claims += [f"{way}.p99<={CELL_M / 4}" for way in ("to_ref", "from_ref")]
+    return step, faces_raw, broken(answer, claims)
+
+
+def stalled_enough(status):
+    """The server's own word on the clients that had stopped reading."""
+    behind = [c for c in status["clients"] if c.get("behind_steps", 0) > 0]
+    missed = max((c.get("behind_bytes", 0) for c in behind), default=0)
+    print(f"note: server's word in the stall: {len(behind)} clients behind, the most by {missed} bytes")
+    return len(behind) >= 2 and missed >= BUFFERS * BUFFER_BYTES
+
+
+def main():
+    build, out = sys.argv[1:3]
+    steps = sorted(int(os.path.basename(f)[:-4]) for f in glob.glob(f"{out}/held/*.ply"))
+    steps = [s for s in steps if s > 0]
+    raw_meshes(build, out, steps)
+    wrong = 0
+    with concurrent.futures.ThreadPoolExecutor(2) as pool:
+        results = list(pool.map(lambda s: judged(out, s), steps))
+    for step, _, sentences in results:
+        for sentence in sentences:
+            print(f"step {step}: {sentence}")
+            wrong += 1
+    print(f"note: {len(steps)} steps held by clients, all judged; {wrong} broken claims; largest raw mesh {max(r[1] for r in results)} faces")
+    with open(f"{out}/held/status.json", encoding="utf-8") as f:
+        status = json.loads(f.readline())
+    if not stalled_enough(status):
+        print(f"the stalled clients were not behind enough: {status['clients']}")
+        wrong += 1
+    return 1 if wrong or len(steps) < 50 else 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())

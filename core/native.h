@@ -8,16 +8,25 @@
 #include "core/model.h"
 #include "core/patch.h"
 
-#define NATIVE_MAJOR 1
-#define NATIVE_MINOR 0
-#define NATIVE_PORT 7878
-#define NATIVE_HEAD 8                    /* u32 length of what follows, u8 type, u8 flags, u16 0 */
+#define NATIVE_MAJOR           1
+#define NATIVE_MINOR           0
+#define NATIVE_PORT            7878
+#define NATIVE_HEAD            8 /* u32 length of what follows, u8 type, u8 flags, u16 0 */
 #define NATIVE_FROM_CLIENT_MAX (64u << 10)
-#define NATIVE_TO_CLIENT_MAX (16u << 20)
+#define NATIVE_TO_CLIENT_MAX   (16u << 20)
 
 enum native_type {
-	NATIVE_HELLO = 1, NATIVE_WANT, NATIVE_BEGIN, NATIVE_PATCH, NATIVE_REMOVE, NATIVE_PLANE, NATIVE_PLANE_GONE,
-	NATIVE_COMMIT, NATIVE_ABORT, NATIVE_JSON, NATIVE_PING
+	NATIVE_HELLO = 1,
+	NATIVE_WANT,
+	NATIVE_BEGIN,
+	NATIVE_PATCH,
+	NATIVE_REMOVE,
+	NATIVE_PLANE,
+	NATIVE_PLANE_GONE,
+	NATIVE_COMMIT,
+	NATIVE_ABORT,
+	NATIVE_JSON,
+	NATIVE_PING
 };
 
 struct native_hello {
@@ -48,10 +57,13 @@ struct native_message {
 		struct native_hello hello;
 		struct native_want want;
 		struct native_begin begin;
-		struct patch *patch;        /* PATCH: reference 1 */
+		struct patch *patch; /* PATCH: reference 1 */
 		struct patch_key remove;
-		uint64_t step;              /* COMMIT, ABORT */
-		struct { const char *text; size_t len; } json; /* borrowed from the bytes */
+		uint64_t step; /* COMMIT, ABORT */
+		struct {
+			const char *text;
+			size_t len;
+		} json; /* borrowed from the bytes */
 	};
 };
 

@@ -8,20 +8,22 @@
 
 #include "core/types.h"
 
-#define SWEEP_MASKS_MAX 8
+#define SWEEP_MASKS_MAX            8
 #define SWEEP_PROFILES_WAITING_MAX 64 /* at the limit the oldest profile is dropped and counted */
 
 struct sweep_params {
 	struct transform base_tilt, tilt_laser; /* base <- tilt axis, tilt <- laser */
 	double range_min_m, range_max_m;
-	struct { double from_rad, to_rad; } mask[SWEEP_MASKS_MAX]; /* bearings left out */
+	struct {
+		double from_rad, to_rad;
+	} mask[SWEEP_MASKS_MAX]; /* bearings left out */
 	int masks;
-	bool has_box;             /* robot.box in the base frame: beams that end in it are the robot */
+	bool has_box; /* robot.box in the base frame: beams that end in it are the robot */
 	struct vec3 box_min, box_max;
 	int64_t hold_ns;
-	bool fixed_tilt;          /* no servo: tilt_rad holds always */
+	bool fixed_tilt; /* no servo: tilt_rad holds always */
 	double tilt_rad;
-	bool fixed_pose;          /* no pose device: map <- base holds always */
+	bool fixed_pose; /* no pose device: map <- base holds always */
 	struct transform map_base;
 	uint32_t raster;
 };
@@ -46,7 +48,8 @@ void sweep_pose(struct sweep *, const struct pose *);
 
 /* Call after every record (ticks too) with its log time until it answers SWEEP_WAIT. With `end` true nothing is waited
  * for any more (end of an input). */
-enum sweep_verdict sweep_next(struct sweep *, int64_t log_ns, bool end, struct row **ret_row, enum sweep_drop *ret_drop);
+enum sweep_verdict sweep_next(struct sweep *, int64_t log_ns, bool end, struct row **ret_row,
+                              enum sweep_drop *ret_drop);
 
 struct sweep_stats {
 	uint64_t profiles, rows, sweeps;

@@ -19,11 +19,11 @@ enum direction { FROM_DEVICE, TO_DEVICE };
 
 /* What the loop hands to a decoder, in the order in which it does (law L7). */
 struct record {
-	int64_t log_ns;            /* never decreases */
-	int64_t t_ns;              /* when the read delivered it; kernel or library stamps where there are any */
-	int device;                /* index into config->device */
+	int64_t log_ns; /* never decreases */
+	int64_t t_ns;   /* when the read delivered it; kernel or library stamps where there are any */
+	int device;     /* index into config->device */
 	enum direction direction;
-	const uint8_t *bytes;      /* borrowed */
+	const uint8_t *bytes; /* borrowed */
 	size_t len;
 };
 
@@ -32,9 +32,9 @@ struct record {
 /* What a decoder saw that the dialogue may wait for: an ACK, a NAK, a telegram. Nothing is decoded twice. */
 struct reply {
 	int64_t t_ns;
-	int kind;                  /* of the protocol: see its header */
+	int kind; /* of the protocol: see its header */
 	size_t len;
-	const uint8_t *payload;    /* borrowed: command byte and data, checked */
+	const uint8_t *payload; /* borrowed: command byte and data, checked */
 };
 
 /* Where decoders put what they found; calls come in the order of the bytes. */
@@ -50,20 +50,23 @@ struct record_sink {
 #define DECODER_COUNTERS_MAX 16
 struct decoder_counters {
 	int n;
-	struct { const char *name; uint64_t count; } counter[DECODER_COUNTERS_MAX];
+	struct {
+		const char *name;
+		uint64_t count;
+	} counter[DECODER_COUNTERS_MAX];
 };
 
 enum device_role { ROLE_LASER, ROLE_TILT, ROLE_POSE };
 
 /* What a dialogue wants done now. */
 struct dialogue_step {
-	size_t write_len;             /* bytes to write now (recorded as TO_DEVICE when written) */
+	size_t write_len; /* bytes to write now (recorded as TO_DEVICE when written) */
 	uint8_t write[64];
-	uint32_t baud;                /* 0, or: set the line to this rate now, after what was written has drained */
-	bool flush;                   /* discard what the line holds */
-	int64_t deadline_ns;          /* call again at the latest then; INT64_MAX: only on a reply */
+	uint32_t baud;       /* 0, or: set the line to this rate now, after what was written has drained */
+	bool flush;          /* discard what the line holds */
+	int64_t deadline_ns; /* call again at the latest then; INT64_MAX: only on a reply */
 	enum dialogue_state { DIALOGUE_CONFIGURING, DIALOGUE_STREAMING, DIALOGUE_FAILED } state;
-	char error[160];              /* DIALOGUE_FAILED: one sentence, what is wrong and what to do */
+	char error[160]; /* DIALOGUE_FAILED: one sentence, what is wrong and what to do */
 };
 
 struct decoder;
@@ -71,7 +74,7 @@ struct dialogue;
 struct link;
 
 struct driver {
-	const char *name;             /* the word after `driver:` */
+	const char *name; /* the word after `driver:` */
 	enum device_role role;
 
 	struct decoder *(*decoder_create)(const struct config_device *, int device);
@@ -84,18 +87,24 @@ struct driver {
 	void (*dialogue_destroy)(struct dialogue *);
 	void (*dialogue_reset)(struct dialogue *, int64_t t_ns); /* the link was opened (anew) */
 	void (*dialogue_reply)(struct dialogue *, const struct reply *);
-	void (*dialogue_data)(struct dialogue *, int64_t t_ns);  /* a profile, tilt or pose was decoded: it lives */
+	void (*dialogue_data)(struct dialogue *, int64_t t_ns); /* a profile, tilt or pose was decoded: it lives */
 	void (*dialogue_step)(struct dialogue *, int64_t t_ns, struct dialogue_step *ret);
 	/* The wish for an orderly end: later steps stop the device; state FAILED with an empty error: done. May be NULL. */
 	void (*dialogue_stop)(struct dialogue *, int64_t t_ns);
 
 	/* open answers at once (a slow connect goes on behind the descriptor); NULL with one sentence in `error`. */
 	struct link *(*link_open)(const struct config_device *, char error[160]);
-	int (*link_fd)(const struct link *);                     /* pollable for reading; -1: nothing to poll or read, it streams for ever (a fixed pose) */
-	ssize_t (*link_read)(struct link *, uint8_t *buf, size_t cap, int64_t *t_ns); /* bytes, 0: nothing now, -errno: lost. *t_ns is changed where the link knows better than the caller */
-	ssize_t (*link_write)(struct link *, const uint8_t *bytes, size_t len);       /* bytes taken (0: would block) or -errno */
-	int (*link_baud)(struct link *, uint32_t baud, char error[160]);              /* NULL where there is none */
-	void (*link_flush)(struct link *);                                            /* may be NULL */
+	int (*link_fd)(
+	    const struct link
+	        *); /* pollable for reading; -1: nothing to poll or read, it streams for ever (a fixed pose) */
+	ssize_t (*link_read)(
+	    struct link *, uint8_t *buf, size_t cap,
+	    int64_t *
+	        t_ns); /* bytes, 0: nothing now, -errno: lost. *t_ns is changed where the link knows better than the caller */
+	ssize_t (*link_write)(struct link *, const uint8_t *bytes,
+	                      size_t len);                               /* bytes taken (0: would block) or -errno */
+	int (*link_baud)(struct link *, uint32_t baud, char error[160]); /* NULL where there is none */
+	void (*link_flush)(struct link *);                               /* may be NULL */
 	void (*link_close)(struct link *);
 };
 

@@ -24,25 +24,26 @@ struct scene {
 
 /* An LMS2xx on a pseudo-terminal. The mirror turns all the time; profiles begin at its phase. */
 struct sim_lms2xx_params {
-	const char *link;     /* path of the symbolic link that is made to the pty's slave */
-	bool fast;            /* drop the wire's pace (not the mirror's): bytes go as fast as they are read */
-	uint32_t baud;        /* rate the device starts with: 9600 as from the factory */
-	int mode;             /* measuring mode in its configuration (protocols A.6), e.g. 0x05: 15 bit */
+	const char *link; /* path of the symbolic link that is made to the pty's slave */
+	bool fast;        /* drop the wire's pace (not the mirror's): bytes go as fast as they are read */
+	uint32_t baud;    /* rate the device starts with: 9600 as from the factory */
+	int mode;         /* measuring mode in its configuration (protocols A.6), e.g. 0x05: 15 bit */
 	bool millimetres;
 };
 struct sim_lms2xx;
 /* NULL with one sentence in `error`. */
-struct sim_lms2xx *sim_lms2xx_create(uv_loop_t *, const struct sim_lms2xx_params *, const struct scene *, char error[160]);
-void sim_lms2xx_destroy(struct sim_lms2xx *); /* closes the pty, removes the link; the loop must run once more */
+struct sim_lms2xx *sim_lms2xx_create(uv_loop_t *, const struct sim_lms2xx_params *, const struct scene *,
+                                     char error[160]);
+void sim_lms2xx_destroy(struct sim_lms2xx *);     /* closes the pty, removes the link; the loop must run once more */
 void sim_lms2xx_power_cycle(struct sim_lms2xx *); /* says 90, falls back to its power-on rate and state */
 
 /* A servo behind Modbus (libmodbus server): really moves with a speed. Position in 0.001 degree, i32 in two registers. */
 enum sim_servo_register { /* holding registers, also readable as input registers; 32-bit values high word first */
-	SIM_SERVO_POSITION = 0, /* 0,1: actual position */
-	SIM_SERVO_TARGET = 2,   /* 2,3: where to go */
-	SIM_SERVO_SPEED = 4,    /* 4,5: 0.001 degree/s, unsigned */
-	SIM_SERVO_MOVING = 6,   /* 1 while it moves */
-	SIM_SERVO_REGISTERS = 16
+	                  SIM_SERVO_POSITION = 0, /* 0,1: actual position */
+	                  SIM_SERVO_TARGET = 2,   /* 2,3: where to go */
+	                  SIM_SERVO_SPEED = 4,    /* 4,5: 0.001 degree/s, unsigned */
+	                  SIM_SERVO_MOVING = 6,   /* 1 while it moves */
+	                  SIM_SERVO_REGISTERS = 16
 };
 struct sim_servo_params {
 	const char *rtu;  /* path of the link to a pty's slave (8N1), or NULL */
@@ -53,14 +54,17 @@ struct sim_servo_params {
 struct sim_servo;
 struct sim_servo *sim_servo_create(const struct sim_servo_params *, char error[160]);
 void sim_servo_destroy(struct sim_servo *);
-int sim_servo_port(const struct sim_servo *);                     /* TCP port it listens on */
-double sim_servo_angle(struct sim_servo *, int64_t t_ns);         /* rad, at any time within the last seconds (CLOCK_MONOTONIC, as uv_hrtime); any thread */
-void sim_servo_place(struct sim_servo *, double angle_rad);       /* stands there from now on (playback steps) */
-uint64_t sim_servo_answers(struct sim_servo *);                   /* position reads so far whose answer was taken in good time, as the next request shows */
+int sim_servo_port(const struct sim_servo *); /* TCP port it listens on */
+double sim_servo_angle(
+    struct sim_servo *,
+    int64_t t_ns); /* rad, at any time within the last seconds (CLOCK_MONOTONIC, as uv_hrtime); any thread */
+void sim_servo_place(struct sim_servo *, double angle_rad); /* stands there from now on (playback steps) */
+uint64_t sim_servo_answers(
+    struct sim_servo *); /* position reads so far whose answer was taken in good time, as the next request shows */
 
 /* Built-in worlds of flat and round things; distances in metres, map frame (z up, floor at 0). */
 struct world;
-struct world *world_create(const char *name, char error[160]);    /* "building", "hall" */
+struct world *world_create(const char *name, char error[160]); /* "building", "hall" */
 void world_destroy(struct world *);
 /* Distance to the first surface along the unit direction, or a negative number for none within `max_m`. */
 double world_cast(const struct world *, struct vec3 origin, struct vec3 direction, double max_m);

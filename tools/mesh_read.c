@@ -154,7 +154,7 @@ static int read_header(struct ply *ply)
 	char line[200];
 	bool format = false;
 	if (!header_line(ply, line) || strcmp(line, "ply") != 0)
-		return refuse(ply, "this is not a PLY file (it does not begin with 'ply')");
+		return refuse(ply, "this is not a PLY file (it does not begin with 'ply'); only .ply is read here");
 	for (;;) {
 		int error = 0;
 		if (!header_line(ply, line))

@@ -145,6 +145,8 @@ static int load(const char *path, struct mesh *mesh)
 	}
 	if (status == -ENOMEM)
 		return complain(path, "not enough memory for this mesh");
+	if (error.line == 0)
+		return complain(path, error.text);
 	fprintf(stderr, "facet: %s:%u: %s\n", path, error.line, error.text);
 	return 1;
 }

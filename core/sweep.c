@@ -6,7 +6,8 @@
  * Turns. A mirror turns at 75 Hz and measures a raster of 1 degree; finer ones take 2 or 4 turns, interlaced: beam k of the
  * profile belongs to turn k mod 2 (4). A servo that moves is at another angle in each turn, so each turn is a row of its own,
  * with its own first bearing. Where the servo stood they are one row again, since neighbours then are 0.5 degree apart,
- * not 1, and no two rows lie upon each other. Partial scans arrive a turn at a time, and are rows as they are.
+ * not 1, and no two rows lie upon each other. Partial scans arrive a turn at a time and are rows as they are; where the servo
+ * stood for all of a raster they are one row too, for which the first ones then wait.
  *
  * Waiting. `hold` is judged when the next record is handled, by its log time (law L7). When it is over, the tilt goes on in a
  * line for 1.5 of its periods, the pose for 50 ms with its last twist; a row with a beam beyond that is dropped whole:
@@ -28,6 +29,8 @@
 
 #include "core/trig.h"
 
+#define FANS                4            /* partial scans of a raster */
+#define SOURCES_MAX         4            /* turns of the mirror in a row */
 #define RING                1024         /* samples, a power of two: 1 s at 1 kHz */
 #define SET_BACK_NS         2000000000LL /* older by more than this: time was set back */
 #define POSE_EXTRAPOLATE_NS 50000000LL
@@ -49,6 +52,13 @@ struct held {
 	int64_t log_ns;
 };
 
+/* Cosine and sine of the bearings of profiles. */
+struct fan {
+	double first_rad, step_rad;
+	uint32_t n;
+	double (*beam)[2];
+};
+
 struct sweep {
 	struct sweep_params params;
 	struct held *held; /* ring of SWEEP_PROFILES_WAITING_MAX */
@@ -60,10 +70,7 @@ struct sweep {
 	struct pose *pose;
 	uint64_t tilt_begin, tilt_end, pose_begin, pose_end;
 
-	/* Sine and cosine of the bearings of the last fan. */
-	double fan_first_rad, fan_step_rad;
-	uint32_t fan_n;
-	double (*fan)[2];
+	struct fan fan[FANS]; /* by the number of a partial scan */
 
 	/* The raster so far. */
 	bool started;
@@ -84,8 +91,12 @@ struct sweep *sweep_create(const struct sweep_params *params)
 	s->held = malloc(SWEEP_PROFILES_WAITING_MAX * sizeof *s->held);
 	s->tilt = malloc(RING * sizeof *s->tilt);
 	s->pose = malloc(RING * sizeof *s->pose);
-	s->fan = malloc(PROFILE_BEAMS_MAX * sizeof *s->fan);
-	if (!s->held || !s->tilt || !s->pose || !s->fan) {
+	bool good = s->held && s->tilt && s->pose;
+	for (int i = 0; i < FANS; i++) {
+		s->fan[i].beam = malloc(PROFILE_BEAMS_MAX * sizeof *s->fan[i].beam);
+		good &= s->fan[i].beam != NULL;
+	}
+	if (!good) {
 		sweep_destroy(s);
 		return NULL;
 	}
@@ -99,7 +110,8 @@ void sweep_destroy(struct sweep *s)
 	free(s->held);
 	free(s->tilt);
 	free(s->pose);
-	free(s->fan);
+	for (int i = 0; i < FANS; i++)
+		free(s->fan[i].beam);
 	free(s);
 }
 
@@ -115,21 +127,21 @@ const char *sweep_drop_name(enum sweep_drop drop)
 	return drop < SWEEP_DROPS ? names[drop] : "unknown";
 }
 
-static struct held *held_head(const struct sweep *s)
+static struct held *held_at(const struct sweep *s, uint32_t i)
 {
-	return &s->held[s->head % SWEEP_PROFILES_WAITING_MAX];
+	return &s->held[(s->head + i) % SWEEP_PROFILES_WAITING_MAX];
 }
 
-static void held_pop(struct sweep *s)
+static void held_pop(struct sweep *s, int n)
 {
-	s->head++;
-	s->waiting--;
+	s->head += (uint32_t)n;
+	s->waiting -= (uint32_t)n;
 	s->turn = s->turns = 0;
 }
 
 static int interlace_of(const struct profile *p)
 {
-	return p->interlace > 1 ? (p->interlace < p->n ? p->interlace : p->n) : 1;
+	return p->interlace > 1 && p->interlace <= SOURCES_MAX && p->interlace <= p->n ? p->interlace : 1;
 }
 
 void sweep_profile(struct sweep *s, const struct profile *p, int64_t log_ns)
@@ -139,11 +151,11 @@ void sweep_profile(struct sweep *s, const struct profile *p, int64_t log_ns)
 	if (p->n == 0)
 		return;
 	if (s->waiting == SWEEP_PROFILES_WAITING_MAX) {
-		int rows = s->turns ? s->turns : interlace_of(&held_head(s)->profile);
+		int rows = s->turns ? s->turns : interlace_of(&held_at(s, 0)->profile);
 		s->lost += (uint64_t)(rows - s->turn);
-		held_pop(s);
+		held_pop(s, 1);
 	}
-	struct held *held = &s->held[(s->head + s->waiting++) % SWEEP_PROFILES_WAITING_MAX];
+	struct held *held = held_at(s, s->waiting++);
 	size_t n = p->n;
 	memcpy(&held->profile, p, offsetof(struct profile, range_m));
 	memcpy(held->profile.range_m, p->range_m, n * sizeof *p->range_m);
@@ -430,18 +442,20 @@ static bool servo_stood(const struct sweep *s, int64_t first_ns, int64_t last_ns
 	return high - low <= STOOD_RAD;
 }
 
-static void fan_prepare(struct sweep *s, const struct profile *p)
+static const struct fan *fan_of(struct sweep *s, const struct profile *p)
 {
-	if (s->fan_n >= p->n && s->fan_first_rad == p->first_rad && s->fan_step_rad == p->step_rad)
-		return;
+	struct fan *fan = &s->fan[p->part % FANS];
+	if (fan->n >= p->n && fan->first_rad == p->first_rad && fan->step_rad == p->step_rad)
+		return fan;
 	for (uint32_t k = 0; k < p->n; k++) {
 		double bearing = p->first_rad + k * p->step_rad;
-		s->fan[k][0] = trig_cos(bearing);
-		s->fan[k][1] = trig_sin(bearing);
+		fan->beam[k][0] = trig_cos(bearing);
+		fan->beam[k][1] = trig_sin(bearing);
 	}
-	s->fan_n = p->n;
-	s->fan_first_rad = p->first_rad;
-	s->fan_step_rad = p->step_rad;
+	fan->n = p->n;
+	fan->first_rad = p->first_rad;
+	fan->step_rad = p->step_rad;
+	return fan;
 }
 
 static bool is_masked(const struct sweep_params *params, double bearing_rad)
@@ -472,34 +486,89 @@ static void judge_beams(const struct sweep_params *params, struct row *row, floa
 	}
 }
 
-/* Which beams of a profile make a row: k = first, first + stride, ... */
-struct pick {
-	uint32_t first, stride, n;
+/* What a row is made of: turns of the mirror. Beam i of this one is beam `first` + i * `stride` of the row. */
+struct source {
+	const struct profile *profile;
+	int turn;
+	uint32_t n, first, stride;
 };
 
-static void copy_beams(const struct sweep_params *params, const struct profile *p, struct pick pick, struct row *row)
+struct recipe {
+	double first_rad, step_rad;
+	int sources;
+	struct source source[SOURCES_MAX];
+};
+
+static void add_source(struct recipe *recipe, const struct profile *p, int turn, int first, int stride)
 {
-	float range_m[PROFILE_BEAMS_MAX];
+	uint32_t interlace = (uint32_t)interlace_of(p), n = (p->n - (uint32_t)turn + interlace - 1) / interlace;
+	recipe->source[recipe->sources++] = (struct source){p, turn, n, (uint32_t)first, (uint32_t)stride};
+}
+
+/* Row `turn` of the `turns` rows of a profile. Where it is the only one (the servo stood) it is placed turn by turn, so that
+ * times only rise. */
+static struct recipe recipe_of_turns(const struct profile *p, int turn, int turns)
+{
+	struct recipe recipe = {p->first_rad + turn * p->step_rad, p->step_rad * turns, 0, {{0}}};
+	if (turns > 1)
+		add_source(&recipe, p, turn, 0, 1);
+	for (int i = 0; turns == 1 && i < interlace_of(p); i++)
+		add_source(&recipe, p, i, i, interlace_of(p));
+	return recipe;
+}
+
+/* The partial scans at the head as one row. */
+static struct recipe recipe_of_parts(const struct sweep *s, int parts)
+{
+	const struct profile *p = &held_at(s, 0)->profile;
+	struct recipe recipe = {p->first_rad, p->step_rad / parts, 0, {{0}}};
+	for (int i = 0; i < parts; i++)
+		add_source(&recipe, &held_at(s, (uint32_t)i)->profile, 0, i, parts);
+	return recipe;
+}
+
+static uint32_t recipe_beams(const struct recipe *recipe)
+{
+	uint32_t n = 0;
+	for (int i = 0; i < recipe->sources; i++) {
+		const struct source *source = &recipe->source[i];
+		uint32_t end = source->n ? source->first + (source->n - 1) * source->stride + 1 : 0;
+		n = end > n ? end : n;
+	}
+	return n;
+}
+
+static void copy_beams(const struct sweep_params *params, const struct recipe *recipe, struct row *row)
+{
+	float range_m[PROFILE_BEAMS_MAX] = {0};
 	uint8_t state[PROFILE_BEAMS_MAX];
-	for (uint32_t i = 0; i < pick.n; i++) {
-		range_m[i] = p->range_m[pick.first + i * pick.stride];
-		state[i] = p->state[pick.first + i * pick.stride];
+	memset(state, BEAM_NO_ECHO, row->n);
+	for (int k = 0; k < recipe->sources; k++) {
+		const struct source *source = &recipe->source[k];
+		const struct profile *p = source->profile;
+		uint32_t interlace = (uint32_t)interlace_of(p), from = (uint32_t)source->turn;
+		for (uint32_t i = 0, at = source->first; i < source->n; i++, from += interlace, at += source->stride) {
+			range_m[at] = p->range_m[from];
+			state[at] = p->state[from];
+		}
 	}
 	judge_beams(params, row, range_m, state);
 }
 
-/* Places the beams of one turn of the mirror; `pick` says which beams of the profile the row holds. */
-static int place_turn(const struct sweep *s, const struct profile *p, int turn, struct pick pick, struct row *row)
+/* Places the beams of one turn of the mirror. 0, or 1 + enum sweep_drop. */
+static int place_turn(struct sweep *s, const struct source *source, struct row *row)
 {
+	const struct profile *p = source->profile;
+	const struct fan *fan = fan_of(s, p);
 	int interlace = interlace_of(p);
+	uint32_t k = (uint32_t)source->turn, at = source->first;
 	struct walk walk;
-	walk_init(&walk, s, beam_time_ns(p, interlace, (uint32_t)turn));
-	for (uint32_t k = (uint32_t)turn; k < p->n; k += (uint32_t)interlace) {
-		struct row_beam *beam = &row->beam[(k - pick.first) / pick.stride];
-		int r = place_beam(&walk, beam_time_ns(p, interlace, k), s->fan[k], beam);
+	walk_init(&walk, s, beam_time_ns(p, interlace, k));
+	for (uint32_t i = 0; i < source->n; i++, k += (uint32_t)interlace, at += source->stride) {
+		int r = place_beam(&walk, beam_time_ns(p, interlace, k), fan->beam[k], &row->beam[at]);
 		if (r)
 			return r;
-		if ((k - pick.first) / pick.stride == pick.n / 2)
+		if (at == row->n / 2)
 			row->tilt_rad = walk.angle_rad;
 	}
 	return 0;
@@ -539,24 +608,21 @@ static void count_row(struct sweep *s, const struct row *row)
 		s->stats.beams[row->beam[i].state]++;
 }
 
-/* The row `turn` of `turns` of a profile. 0, -1 without memory, or 1 + enum sweep_drop. */
-static int make_row(struct sweep *s, const struct profile *p, int turn, int turns, struct row **ret)
+/* 0, -1 without memory, or 1 + enum sweep_drop. */
+static int make_row(struct sweep *s, const struct recipe *recipe, struct row **ret)
 {
-	uint32_t first = (uint32_t)turn, stride = (uint32_t)turns;
-	struct pick pick = {first, stride, (p->n - first + stride - 1) / stride};
-	int interlace = interlace_of(p), r = 0;
-	struct row *row = row_create(pick.n);
+	const struct source *first = &recipe->source[0];
+	struct row *row = row_create(recipe_beams(recipe));
+	int r = 0;
 	if (!row)
 		return -1;
 	row->raster = s->params.raster;
-	row->t_ns = beam_time_ns(p, interlace, first);
-	row->first_rad = p->first_rad + turn * p->step_rad;
-	row->step_rad = p->step_rad * turns;
-	copy_beams(&s->params, p, pick, row);
-	fan_prepare(s, p);
-	/* A row of all turns (the servo stood) is placed turn by turn, so that times only rise. */
-	for (int i = turn; r == 0 && i < interlace; i += turns)
-		r = place_turn(s, p, i, pick, row);
+	row->t_ns = beam_time_ns(first->profile, interlace_of(first->profile), (uint32_t)first->turn);
+	row->first_rad = recipe->first_rad;
+	row->step_rad = recipe->step_rad;
+	copy_beams(&s->params, recipe, row);
+	for (int i = 0; r == 0 && i < recipe->sources; i++)
+		r = place_turn(s, &recipe->source[i], row);
 	if (r) {
 		row_destroy(row);
 		return r;
@@ -565,6 +631,41 @@ static int make_row(struct sweep *s, const struct profile *p, int turn, int turn
 	count_row(s, row);
 	*ret = row;
 	return 0;
+}
+
+/* Does `next` go on with the partial scans that `before` belongs to? */
+static bool is_next_part(const struct profile *before, const struct profile *next)
+{
+	int64_t apart_ns = next->t_ns - before->t_ns;
+	return next->part == before->part + 1 && next->parts == before->parts && next->step_rad == before->step_rad &&
+	       interlace_of(next) == 1 && apart_ns > 0 && apart_ns <= 3 * (int64_t)before->turn_ns / 2;
+}
+
+/* How many profiles at the head are one row: the partial scans of a raster, if the servo stood from the first to the last;
+ * else 1. 0: they may become one, wait. */
+static int parts_together(const struct sweep *s, int64_t log_ns, bool end)
+{
+	const struct held *first = held_at(s, 0), *last = first;
+	const struct profile *p = &first->profile;
+	uint32_t longest = p->n;
+	if (p->parts < 2 || p->parts > SOURCES_MAX || p->part != 0 || interlace_of(p) != 1)
+		return 1;
+	for (uint32_t i = 1; i < p->parts; i++) {
+		if (i == s->waiting) {
+			int64_t set_ns = (int64_t)p->parts * p->turn_ns;
+			bool late = end || log_ns - first->log_ns >= s->params.hold_ns + set_ns;
+			return late || !servo_stood(s, p->t_ns, last_beam_ns(p) + set_ns - p->turn_ns) ? 1 : 0;
+		}
+		if (!is_next_part(&last->profile, &held_at(s, i)->profile))
+			return 1;
+		last = held_at(s, i);
+		longest = last->profile.n > longest ? last->profile.n : longest;
+	}
+	int64_t last_ns = last_beam_ns(&last->profile);
+	if (longest * p->parts > PROFILE_BEAMS_MAX || !servo_stood(s, p->t_ns, last_ns))
+		return 1;
+	bool waits = !end && !samples_reach(s, last_ns) && log_ns - last->log_ns < s->params.hold_ns;
+	return waits ? 0 : p->parts;
 }
 
 static enum sweep_verdict dropped(struct sweep *s, enum sweep_drop drop, enum sweep_drop *ret_drop)
@@ -583,20 +684,25 @@ enum sweep_verdict sweep_next(struct sweep *s, int64_t log_ns, bool end, struct 
 	}
 	if (s->waiting == 0)
 		return SWEEP_WAIT;
-	struct held *held = held_head(s);
+	const struct held *held = held_at(s, 0);
 	const struct profile *p = &held->profile;
+	int parts = 1;
 	if (s->turns == 0) {
 		int64_t last_ns = last_beam_ns(p);
 		if (!end && !samples_reach(s, last_ns) && log_ns - held->log_ns < s->params.hold_ns)
 			return SWEEP_WAIT;
+		parts = parts_together(s, log_ns, end);
+		if (parts == 0)
+			return SWEEP_WAIT;
 		s->turns = servo_stood(s, p->t_ns, last_ns) ? 1 : interlace_of(p);
 	}
+	struct recipe recipe = parts > 1 ? recipe_of_parts(s, parts) : recipe_of_turns(p, s->turn, s->turns);
 	struct row *row = NULL;
-	int r = make_row(s, p, s->turn, s->turns, &row);
+	int r = make_row(s, &recipe, &row);
 	if (r < 0)
 		return SWEEP_NOMEM;
 	if (++s->turn == s->turns)
-		held_pop(s);
+		held_pop(s, parts);
 	if (r > 0)
 		return dropped(s, (enum sweep_drop)(r - 1), ret_drop);
 	row->ends_sweep = end && s->waiting == 0;

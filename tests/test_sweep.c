@@ -218,6 +218,112 @@ static void a_partial_scan_is_a_row_with_its_own_bearings(void **state)
 	sweep_destroy(s);
 }
 
+/* Partial scan `part` of a quarter degree, one turn after the other. */
+static struct profile *make_part(int part, int64_t t_ns)
+{
+	struct profile *p = make_profile(t_ns + part * TURN_NS, 1, 5 + 0.01f * (float)part);
+	p->n = part == 0 ? 181 : 180;
+	p->part = (uint8_t)part;
+	p->parts = 4;
+	p->first_rad += part * 0.25 * TRIG_DEG;
+	return p;
+}
+
+static struct sweep *on_a_moving_robot(void)
+{
+	struct sweep_params params = plain_params();
+	params.fixed_pose = false;
+	struct sweep *s = sweep_create(&params);
+	for (int64_t t = 0; t <= 300 * MS; t += 10 * MS)
+		add_pose(s, t, 1.5e-9 * (double)t);
+	return s;
+}
+
+static void partial_scans_are_one_row_when_the_servo_stood(void **state)
+{
+	struct sweep *s = on_a_moving_robot();
+	(void)state;
+	for (int64_t t = 90 * MS; t <= 160 * MS; t += 5 * MS)
+		add_tilt(s, t, 0.25);
+	add_tilt(s, 165 * MS, 0.5); /* it moves on, but only afterwards */
+	for (int part = 0; part < 4; part++) {
+		expect_wait(s, 150 * MS);
+		sweep_profile(s, make_part(part, 100 * MS), 150 * MS);
+	}
+	struct row *row = expect_row(s, 150 * MS);
+	assert_int_equal(row->n, 721);
+	assert_true(fabs(row->step_rad - 0.25 * TRIG_DEG) < 1e-12);
+	for (int i = 0; i < 721; i++) {
+		double time_s = 0.1 + i % 4 * 1e-9 * TURN_NS + i / 4 * 1e-9 * BEAM_NS,
+		       bearing = (-90 + 0.25 * i) * TRIG_DEG;
+		assert_true(fabs(row->beam[i].origin.x - 1.5 * time_s) < 1e-9);
+		assert_true(row->beam[i].range_m == 5 + 0.01f * (float)(i % 4));
+		assert_true(fabs(row->beam[i].point.y - (double)row->beam[i].range_m * sin(bearing)) < 1e-9);
+	}
+	row_destroy(row);
+	expect_wait(s, 150 * MS);
+	sweep_destroy(s);
+}
+
+static void expect_parts_alone(struct sweep *s, int n, int64_t log_ns)
+{
+	for (int i = 0; i < n; i++) {
+		struct row *row = expect_row(s, log_ns);
+		assert_true(row->n <= 181);
+		row_destroy(row);
+	}
+	expect_wait(s, log_ns);
+}
+
+static void partial_scans_do_not_wait_for_one_that_was_lost(void **state)
+{
+	struct sweep *s = on_a_moving_robot();
+	(void)state;
+	for (int64_t t = 90 * MS; t <= 300 * MS; t += 5 * MS)
+		add_tilt(s, t, 0.25);
+	sweep_profile(s, make_part(0, 100 * MS), 110 * MS);
+	sweep_profile(s, make_part(1, 100 * MS), 123 * MS);
+	expect_wait(s, 124 * MS);
+	sweep_profile(s, make_part(3, 100 * MS), 150 * MS);
+	expect_parts_alone(s, 3, 150 * MS);
+	sweep_profile(s, make_part(0, 200 * MS), 210 * MS);
+	expect_wait(s, 210 * MS + 30 * MS + 4 * TURN_NS - 1);
+	expect_parts_alone(s, 1, 210 * MS + 30 * MS + 4 * TURN_NS);
+	sweep_destroy(s);
+}
+
+static void partial_scans_do_not_wait_once_the_servo_moves(void **state)
+{
+	struct sweep *s = on_a_moving_robot();
+	(void)state;
+	for (int64_t t = 90 * MS; t <= 120 * MS; t += 5 * MS)
+		add_tilt(s, t, 0.25);
+	sweep_profile(s, make_part(0, 100 * MS), 110 * MS);
+	expect_wait(s, 121 * MS);
+	add_tilt(s, 125 * MS, 0.26);
+	expect_parts_alone(s, 1, 125 * MS);
+	sweep_destroy(s);
+}
+
+/* A raster too wide for a row, and one whose parts are of most unequal length. */
+static void partial_scans_that_do_not_fit_a_row_stay_alone(void **state)
+{
+	struct sweep *s = on_a_moving_robot();
+	(void)state;
+	for (int64_t t = 90 * MS; t <= 300 * MS; t += 5 * MS)
+		add_tilt(s, t, 0.25);
+	for (int part = 0; part < 4; part++) {
+		struct profile *p = make_part(part, 100 * MS);
+		if (part == 1)
+			p->n = 513;
+		sweep_profile(s, p, 150 * MS);
+	}
+	for (int i = 0; i < 4; i++)
+		row_destroy(expect_row(s, 300 * MS));
+	expect_wait(s, 300 * MS);
+	sweep_destroy(s);
+}
+
 static void a_profile_waits_for_samples_behind_its_last_beam(void **state)
 {
 	struct sweep_params params = plain_params();
@@ -688,8 +794,7 @@ static void real_sweeps_have_the_beams_that_are_written_down(void **state)
 				    scan.row[r].range_m[k] > 30;
 		int cells = (int)(scan.rows * scan.row[0].n);
 		assert_int_equal(stats.beams[BEAM_OK] + stats.beams[BEAM_MIXED], usable[i]);
-		assert_int_equal((invalid * 10000 + cells / 2) / cells,
-		                 invalid_per_myriad[i]);
+		assert_int_equal((invalid * 10000 + cells / 2) / cells, invalid_per_myriad[i]);
 		assert_true(fabs(100.0 * candidates(&scan) / cells - mixed_percent[i]) < 0.1);
 		assert_int_equal(stats.sweeps, 1);
 		sweep_destroy(s);
@@ -710,6 +815,10 @@ int main(void)
 	    cmocka_unit_test(turns_are_one_row_when_the_servo_stood),
 	    cmocka_unit_test(one_row_of_two_turns_keeps_each_beams_time),
 	    cmocka_unit_test(a_partial_scan_is_a_row_with_its_own_bearings),
+	    cmocka_unit_test(partial_scans_are_one_row_when_the_servo_stood),
+	    cmocka_unit_test(partial_scans_do_not_wait_for_one_that_was_lost),
+	    cmocka_unit_test(partial_scans_do_not_wait_once_the_servo_moves),
+	    cmocka_unit_test(partial_scans_that_do_not_fit_a_row_stay_alone),
 	    cmocka_unit_test(a_profile_waits_for_samples_behind_its_last_beam),
 	    cmocka_unit_test(hold_is_judged_by_the_log_time_of_the_next_record),
 	    cmocka_unit_test(nothing_is_waited_for_at_the_end_of_an_input),

@@ -3,7 +3,8 @@
  * One assembler per scanner. A profile is held until tilt and pose samples newer than its last beam exist, at most
  * `hold` (in recorded time); then the tilt may be extrapolated by 1.5 sample periods and the pose by 50 ms; beyond that
  * the row is dropped and counted. Turns of an interlaced profile, and the partial scans of a raster, are rows of their own
- * unless the servo stood for all of them; partial scans wait for each other while it stands, `hold` and a raster's time at most. Time is what the caller says (log time of the record being handled): no clock here. */
+ * unless the servo stood for all of them; while it stands, partial scans wait for each other, `hold` and the time of a
+ * raster at most. Time is what the caller says (log time of the record being handled): no clock here. */
 #ifndef FACET_CORE_SWEEP_H
 #define FACET_CORE_SWEEP_H
 

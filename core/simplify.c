@@ -245,15 +245,14 @@ static void give_turn(struct pass *pass, uint32_t v)
 		heap_remove(pass, v);
 }
 
-/* Something around v has changed. Its cost is looked at when its turn comes, but at once where it has none, or where
- * its target has changed. */
-static void notice(struct pass *pass, uint32_t v, uint32_t gone, uint32_t changed)
+/* Something around v has changed. Costs hardly ever fall by that, so it is looked at when its turn comes; at once only
+ * where it has none, or one that comes late because cheaper targets were refused. */
+static void notice(struct pass *pass, uint32_t v)
 {
 	if (pass->s->fixed[v])
 		return;
 	pass->stale[v] = true;
-	uint32_t target = pass->best[v].u;
-	if (pass->place[v] == UINT32_MAX || pass->tried[v] || target == gone || target == changed)
+	if (pass->place[v] == UINT32_MAX || pass->tried[v])
 		give_turn(pass, v);
 }
 
@@ -487,16 +486,16 @@ static bool try_target(struct pass *pass, uint32_t v, const struct target *targe
 	return true;
 }
 
-static void notice_around(struct pass *pass, uint32_t u, uint32_t gone)
+static void notice_around(struct pass *pass, uint32_t u)
 {
 	const struct halfedge_mesh *mesh = &pass->s->mesh;
 	if (!pass->s->fixed[u])
 		give_turn(pass, u);
 	HALFEDGE_EACH(mesh, h, u)
 	{
-		notice(pass, halfedge_target(mesh, h), gone, u);
+		notice(pass, halfedge_target(mesh, h));
 		if (mesh->twin[halfedge_previous(h)] == HALFEDGE_NONE)
-			notice(pass, mesh->origin[halfedge_previous(h)], gone, u);
+			notice(pass, mesh->origin[halfedge_previous(h)]);
 	}
 }
 
@@ -521,7 +520,7 @@ static void take_turn(struct pass *pass, uint32_t v)
 		}
 		return;
 	}
-	notice_around(pass, target.u, v);
+	notice_around(pass, target.u);
 }
 
 static int reserve(struct pass *pass, uint32_t nv, struct arena *arena)

@@ -61,6 +61,7 @@ struct world {
 	int64_t due_ns;
 	int profiles, bytes_written, writes;
 	int64_t write_ns[REQUESTS]; /* of the first writes */
+	uint32_t write_baud[REQUESTS];
 	int64_t byte_ns, least_gap_ns;
 	int stall_after;  /* the host is busy after this many bytes ... */
 	int64_t stall_ns; /* ... for so long */
@@ -222,7 +223,7 @@ static void stream(struct world *w)
 		put(w, w->now_ns + transfer_ns, bytes, len);
 }
 
-static void power_cycle(struct world *w)
+static void power_cycle(struct world *w, int64_t boot_ns)
 {
 	struct scanner *s = &w->scanner;
 	s->baud = s->power_on_baud;
@@ -231,7 +232,7 @@ static void power_cycle(struct world *w)
 	s->resolution_cdeg = 50;
 	s->next_scan_ns = NEVER;
 	w->outs = 0;
-	put_payload(w, 10 * SECONDS, (const uint8_t[]){LMS2XX_POWER_ON, 'L', 'M', 'S', 0x13}, 5);
+	put_payload(w, boot_ns, (const uint8_t[]){LMS2XX_POWER_ON, 'L', 'M', 'S', 0x13}, 5);
 }
 
 static void on_profile(void *ctx, int device, const struct profile *p)
@@ -261,8 +262,10 @@ static void decode(struct world *w, enum direction direction, const uint8_t *byt
 static void note_write(struct world *w)
 {
 	const int64_t gap_ns = w->now_ns - w->byte_ns;
-	if (w->writes < REQUESTS)
+	if (w->writes < REQUESTS) {
+		w->write_baud[w->writes] = w->line_baud;
 		w->write_ns[w->writes++] = w->now_ns;
+	}
 	if (w->bytes_written > 0) {
 		w->least_gap_ns = gap_ns < w->least_gap_ns ? gap_ns : w->least_gap_ns;
 	}
@@ -556,6 +559,11 @@ static void nobody_there_is_said_in_a_sentence(void **state)
 	assert_string_equal(
 	    w->step.error,
 	    "no scanner answers at 500000, 9600, 38400, 19200 Bd: check its power, the cable, and `port`");
+	int at_9600 = 0;
+	for (int i = 0; i < w->writes; i++)
+		at_9600 += w->write_baud[i] == 9600;
+	assert_int_equal(at_9600,
+	                 2); /* it is asked twice at a rate: its first answer may be lost behind a measurement */
 	/* The supervisor comes back later, and then somebody is there. */
 	w->scanner.deaf = false;
 	driver_lms2xx.dialogue_reset(w->dialogue, w->now_ns);
@@ -594,12 +602,37 @@ static void a_power_cycle_while_streaming_sets_everything_up_anew(void **state)
 		w->config->device[0].fov_deg = 100;
 		begin(w);
 		must_stream(w, 20 * SECONDS);
-		power_cycle(w);
+		power_cycle(w, 10 * SECONDS);
 		run(w, w->now_ns + 20 * SECONDS, DIALOGUE_CONFIGURING);
 		assert_int_equal(w->step.state, DIALOGUE_CONFIGURING);
 		must_stream(w, 60 * SECONDS);
 		assert_int_equal(w->scanner.fov_deg, 100);
 	}
+}
+
+static void a_message_of_power_on_is_not_waited_after(void **state)
+{
+	struct world *w = *state;
+	w->scanner.power_on_baud = 500000;
+	begin(w);
+	must_stream(w, 20 * SECONDS);
+	power_cycle(w, 100 * MS);
+	const int64_t since_ns = w->now_ns;
+	run(w, w->now_ns + 20 * SECONDS, DIALOGUE_CONFIGURING);
+	assert_in_range(w->now_ns - since_ns, 100 * MS, 200 * MS);
+	must_stream(w, 20 * SECONDS);
+}
+
+static void an_acknowledgement_behind_a_measurement_is_waited_for(void **state)
+{
+	struct world *w = *state;
+	w->config->device[0].baud = 9600;
+	w->scanner.mode = LMS2XX_MODE_STREAM;
+	w->scanner.next_scan_ns = w->now_ns + 29 * MS; /* takes 762 ms */
+	begin(w);
+	must_stream(w, 20 * SECONDS);
+	assert_int_equal(w->scanner.request[0], LMS2XX_MODE);
+	assert_int_equal(w->scanner.request[1], LMS2XX_TYPE);
 }
 
 static void two_seconds_of_silence_begin_anew(void **state)
@@ -675,6 +708,8 @@ int main(void)
 	    RIGGED(nobody_there_is_said_in_a_sentence),
 	    RIGGED(refusals_are_said_in_a_sentence),
 	    RIGGED(a_power_cycle_while_streaming_sets_everything_up_anew),
+	    RIGGED(a_message_of_power_on_is_not_waited_after),
+	    RIGGED(an_acknowledgement_behind_a_measurement_is_waited_for),
 	    RIGGED(two_seconds_of_silence_begin_anew),
 	    RIGGED(the_stop_is_sent_and_ends_it),
 	    RIGGED(a_stop_ends_in_any_state_whoever_is_there),

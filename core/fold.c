@@ -16,7 +16,7 @@
 #include <string.h>
 
 #define SLOTS        (4 * FOLD_BLOCKS_MAX)
-#define BAND_UNITS ((int32_t)(BAND_CELLS * LATTICE))
+#define BAND_UNITS   ((int32_t)(BAND_CELLS * LATTICE))
 #define WEIGHT_SCALE 4
 
 _Static_assert((SLOTS & (SLOTS - 1)) == 0, "slots are a power of two");

@@ -121,7 +121,8 @@ int main(int argc, char **argv)
 	patch_store_hash(s.store, hash);
 	struct pipeline_stats stats;
 	pipeline_stats(p, &stats);
-	printf("%s %llu profiles %llu steps\n", hash, (unsigned long long)stats.sweep.profiles, (unsigned long long)map_step(s.map));
+	printf("%s %llu profiles %llu steps\n", hash, (unsigned long long)stats.sweep.profiles,
+	       (unsigned long long)map_step(s.map));
 	pipeline_destroy(p);
 	return 0;
 }

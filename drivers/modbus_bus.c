@@ -32,7 +32,7 @@
 #include <time.h>
 #include <unistd.h>
 
-#define RESPONSE_US    250000
+#define RESPONSE_US    500000 /* busy machines were seen to sleep for 0.4 s */
 #define BYTE_US        100000
 #define CONNECT_S      1
 #define FAILURES_MAX   3
@@ -105,7 +105,7 @@ static void sleep_until(int64_t t_ns)
 /* What another program holds is not ours; the thread of a link just closed may need a moment to let go. */
 static int lock_line(int fd)
 {
-	for (int i = 0; i < 60; i++) {
+	for (int i = 0; i < 100; i++) {
 		if (flock(fd, LOCK_EX | LOCK_NB) == 0)
 			return 0;
 		sleep_until(monotonic_ns() + 10000000);
@@ -163,12 +163,12 @@ static void bus_disconnect(struct bus *bus)
 	bus->modbus = NULL;
 }
 
-/* Reads away what still comes, until the line was silent for a response time; at most ten of them. */
+/* Reads away what still comes, until the line was silent for a response time; at most four of them. */
 static void drain(struct bus *bus)
 {
 	struct pollfd p = {.fd = modbus_get_socket(bus->modbus), .events = POLLIN};
 	uint8_t waste[256];
-	int64_t end_ns = monotonic_ns() + INT64_C(10) * RESPONSE_US * 1000;
+	int64_t end_ns = monotonic_ns() + INT64_C(4) * RESPONSE_US * 1000;
 
 	while (monotonic_ns() < end_ns && poll(&p, 1, RESPONSE_US / 1000) > 0)
 		if (read(p.fd, waste, sizeof waste) <= 0)

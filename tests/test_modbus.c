@@ -882,7 +882,7 @@ static void *late_peer_thread(void *arg)
 			continue;
 		map->tab_registers[1] = (uint16_t)served;
 		if (served++ == 0)
-			usleep(400000); /* later than the driver's 250 ms */
+			usleep(700000); /* later than the driver's 500 ms */
 		modbus_reply(peer->modbus, request, n, map);
 	}
 	modbus_mapping_free(map);

@@ -119,7 +119,14 @@ static void a_line_waits_for_answers_on_both_sides_and_a_sweep_for_poses(void **
 	assert_true(playback_ready(p, seen));
 	playback_scan(p, &profile);
 	assert_int_equal(rint(profile.range_m[1] * 1000.0), 2000);
-	assert_false(playback_ready(p, seen)); /* never twice */
+	assert_false(playback_ready(p, seen)); /* never twice ... */
+	playback_lost(p, seen);
+	assert_false(playback_ready(p, seen));
+	seen.answers += 3;
+	seen.poses += 3;
+	assert_true(playback_ready(p, seen)); /* ... unless its reader could not read it: then it is measured again */
+	playback_scan(p, &profile);
+	assert_int_equal(rint(profile.range_m[1] * 1000.0), 2000);
 	seen.answers += 9;
 	assert_false(playback_advance(p, seen)); /* not yet taken */
 	playback_taken(p, seen);

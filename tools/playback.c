@@ -440,6 +440,14 @@ void playback_taken(struct playback *p, struct playback_seen seen)
 	p->phase = TAKEN;
 }
 
+void playback_lost(struct playback *p, struct playback_seen seen)
+{
+	if (p->phase != MEASURED)
+		return;
+	p->since = seen;
+	p->phase = STANDING;
+}
+
 bool playback_ended(const struct playback *p)
 {
 	return p->phase == ENDED;
@@ -491,6 +499,14 @@ static void stage_taken(void *ctx, int64_t t_ns)
 
 	(void)t_ns;
 	playback_taken(t->playback, seen_by(t));
+}
+
+static void stage_lost(void *ctx, int64_t t_ns)
+{
+	struct theatre *t = ctx;
+
+	(void)t_ns;
+	playback_lost(t->playback, seen_by(t));
 }
 
 static struct pose stage_pose(void *ctx, int64_t t_ns)
@@ -553,13 +569,14 @@ int playback_stage(const char *source, char *const *more, int n, struct stage *r
 		free(t);
 		return r;
 	}
-	*ret = (struct stage){.ctx = t,
-	                      .scene = {.ctx = t, .scan = stage_scan, .ready = stage_ready, .taken = stage_taken},
-	                      .angle_rad = playback_angle(t->playback),
-	                      .join = stage_join,
-	                      .pose = stage_pose,
-	                      .pose_sent = stage_pose_sent,
-	                      .ended = stage_ended,
-	                      .destroy = stage_destroy};
+	*ret = (struct stage){
+	    .ctx = t,
+	    .scene = {.ctx = t, .scan = stage_scan, .ready = stage_ready, .taken = stage_taken, .lost = stage_lost},
+	    .angle_rad = playback_angle(t->playback),
+	    .join = stage_join,
+	    .pose = stage_pose,
+	    .pose_sent = stage_pose_sent,
+	    .ended = stage_ended,
+	    .destroy = stage_destroy};
 	return 0;
 }

@@ -58,6 +58,7 @@ void playback_placed(struct playback *, struct playback_seen);
 bool playback_ready(const struct playback *, struct playback_seen);
 void playback_scan(struct playback *, struct profile *);
 void playback_taken(struct playback *, struct playback_seen);
+void playback_lost(struct playback *, struct playback_seen); /* its reader did not understand it: the same line again */
 bool playback_ended(const struct playback *);
 uint32_t playback_lines(const struct playback *); /* taken so far */
 

@@ -69,6 +69,7 @@ struct sim_lms2xx {
 	int64_t wire_end_ns; /* when its last byte has left at the wire's pace */
 	uint8_t garble;
 	bool awaited; /* a profile is on its way to the reader */
+	bool spoiled; /* and some of it went out at a rate that the reader does not have */
 };
 
 /* The wire */
@@ -115,8 +116,10 @@ static void pump(struct sim_lms2xx *sim, int64_t now_ns)
 		uint8_t chunk[QUEUE];
 		const size_t n = due - sim->sent;
 		memcpy(chunk, sim->queue + sim->sent, n);
-		if (rates_differ(sim))
+		if (rates_differ(sim)) {
 			garble(sim, chunk, n);
+			sim->spoiled = true;
+		}
 		const ssize_t wrote = write(sim->master, chunk, n);
 		if (wrote > 0)
 			sim->sent += (size_t)wrote;
@@ -137,7 +140,10 @@ static void watch_reader(struct sim_lms2xx *sim, int64_t now_ns)
 	if (!sim->awaited || sim->len > 0 || poll(&line, 1, 0) != 0)
 		return;
 	sim->awaited = false;
-	sim->scene.taken(sim->scene.ctx, now_ns);
+	if (sim->spoiled && sim->scene.lost != NULL)
+		sim->scene.lost(sim->scene.ctx, now_ns);
+	else
+		sim->scene.taken(sim->scene.ctx, now_ns);
 }
 
 /* The mirror: 75 turns a second are one in 40/3 ms. */
@@ -222,6 +228,7 @@ static void end_scan(struct sim_lms2xx *sim)
 	sim->part = (sim->part + 1) & 3;
 	enqueue(sim, telegram, len, end_ns);
 	sim->awaited = sim->scene.taken != NULL;
+	sim->spoiled = false;
 }
 
 static bool wants_scan(const struct sim_lms2xx *sim)

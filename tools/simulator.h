@@ -20,6 +20,8 @@ struct scene {
 	bool (*ready)(void *ctx, int64_t t_ns);
 	/* The profile begun last was taken by its reader (nothing of it is left in the line). May be NULL. */
 	void (*taken)(void *ctx, int64_t t_ns);
+	/* Instead: its reader cannot have understood it (another rate was set): it is to be measured again. May be NULL. */
+	void (*lost)(void *ctx, int64_t t_ns);
 };
 
 /* An LMS2xx on a pseudo-terminal. The mirror turns all the time; profiles begin at its phase. */

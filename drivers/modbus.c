@@ -48,7 +48,7 @@ static void decoder_destroy(struct decoder *d)
 
 static int64_t rtt_median(const struct decoder *d)
 {
-	int64_t sorted[RTT_KEPT];
+	int64_t sorted[RTT_KEPT] = {0};
 
 	for (int i = 0; i < d->rtt_n; i++) {
 		int at = i;

@@ -106,10 +106,10 @@ static int open_unix(struct link *link, const char *path, char error[160])
 	strcpy(address.sun_path, path);
 	link->fd = socket(AF_UNIX, SOCK_DGRAM | SOCK_NONBLOCK | SOCK_CLOEXEC, 0);
 	r = link->fd < 0 ? -errno : 0;
-	if (!r)
+	if (!r) {
 		fchmod(link->fd, 0660);
-	if (!r)
 		r = bind_path(link->fd, &address);
+	}
 	if (r) {
 		snprintf(error, 160, "unix:%.90s: %s", path,
 		         r == -EADDRINUSE ? "somebody listens there already, or it is no socket" : strerror(-r));

@@ -162,16 +162,18 @@ static void receive(struct test *t, struct client *c)
 /* The server's own word that somebody is behind, shortly before the stall ends. */
 static void keep_status(struct test *t)
 {
-	char path[512], text[65536];
+	char path[512];
+	static char text[65536];
 	size_t len = 0;
 	int fd = connect_unix(t->unix_path);
 	if (write(fd, "?STATUS\n", 8) != 8)
 		fail("status", strerror(errno));
-	while (len < sizeof text && !memchr(text, '\n', len)) {
-		ssize_t n = read(fd, text + len, sizeof text - len);
+	while (len + 1 < sizeof text && !(strstr(text, "\"STATUS\"") && text[len - 1] == '\n')) {
+		ssize_t n = read(fd, text + len, sizeof text - 1 - len);
 		if (n <= 0)
 			fail("status", "no answer");
 		len += (size_t)n;
+		text[len] = 0;
 	}
 	close(fd);
 	snprintf(path, sizeof path, "%s/status.json", t->dir);

@@ -15,7 +15,7 @@ timeout -k 5 240 "$build/facet" simulate "profiles:$tilt/kurt3d_scan0_profiles.c
     "$tilt/kurt3d_scan2_profiles.csv" --speed max --dir "$out/d" -- sh -eu -c '
     "$build/facetd" --journal "$out/journal" 2>"$out/log" &
     daemon=$!
-    until [ -S "$out/d/facetd.sock" ]; do sleep 0.1; done
+    until [ -S "$out/d/facetd.sock" ]; do kill -0 $daemon; sleep 0.1; done
     "$build/facet" save --wait-steps 678 --timeout 200 -o "$out/live.ply"
     kill $daemon
     wait $daemon

@@ -37,11 +37,12 @@ def judged(out, step):
 
 
 def stalled_enough(status):
-    """The server's own word on the clients that had stopped reading."""
-    behind = [c for c in status["clients"] if c.get("behind_steps", 0) > 0]
-    missed = max((c.get("behind_bytes", 0) for c in behind), default=0)
-    print(f"note: server's word in the stall: {len(behind)} clients behind, the most by {missed} bytes")
-    return len(behind) >= 2 and missed >= BUFFERS * BUFFER_BYTES
+    """The server's own counters, from within the stall: what the clients that had stopped reading missed meanwhile."""
+    native = [c for c in status["clients"] if c["kind"] == "native"]
+    most = max(c["bytes"] for c in native)
+    behind = [most - c["bytes"] for c in native if c["behind"] > 0 and most - c["bytes"] >= BUFFERS * BUFFER_BYTES]
+    print(f"note: in the stall the server counts {len(behind)} clients behind by {behind} bytes, buffers are {BUFFER_BYTES}")
+    return len(behind) >= 2
 
 
 def main():
@@ -58,7 +59,7 @@ def main():
             wrong += 1
     print(f"note: {len(steps)} steps held by clients, all judged; {wrong} broken claims; largest raw mesh {max(r[1] for r in results)} faces")
     with open(f"{out}/held/status.json", encoding="utf-8") as f:
-        status = json.loads(f.readline())
+        status = next(o for o in map(json.loads, f) if o["class"] == "STATUS")
     if not stalled_enough(status):
         print(f"the stalled clients were not behind enough: {status['clients']}")
         wrong += 1

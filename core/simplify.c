@@ -23,11 +23,12 @@
 
 #define COSINE_TURN  0.30901699437494742 /* 72 degrees */
 #define VALENCE_MAX  24
-#define FLATS_MAX    256   /* triangles at a vertex before that */
-#define RIM_SIDEWAYS 0.5   /* cells */
-#define RIM_GAP      5     /* lattice units a rim vertex keeps from other rim edges, 0.02 cell */
-#define ERROR_SHARE  0.1   /* of the sum of squared distances, in the cost */
-#define LENGTH_SHARE 0.002 /* of the squared way */
+#define FLATS_MAX    256             /* triangles at a vertex before that */
+#define RIM_SIDEWAYS 0.5             /* cells */
+#define RIM_GAP      5               /* lattice units a rim vertex keeps from other rim edges, 0.02 cell */
+#define ERROR_SHARE  0.1             /* of the sum of squared distances, in the cost */
+#define WIDE         (1.2 * LATTICE) /* a side beyond which the middle of a triangle is looked at */
+#define LENGTH_SHARE 0.002           /* of the squared way */
 
 struct target {
 	double cost;
@@ -451,16 +452,19 @@ static void commit(struct pass *pass, uint32_t v, uint32_t u, uint32_t h, bool r
 	}
 }
 
-/* Whether the new edges of u and the middles of its new triangles run where the raw surface was. */
+/* Whether the new edges of u, and the middles of new triangles that are wide, run where the raw surface was. Each new edge is
+ * the first side of one of the triangles. */
 static bool flats_stay_near(const struct pass *pass)
 {
 	const struct nearby *nearby = &pass->s->nearby;
 	for (uint32_t f = 0; f < pass->flats; f++) {
 		const struct flat *flat = &pass->flat[f];
+		if (!nearby_has_segment(nearby, flat->a, vec3_add(flat->a, flat->ab)))
+			return false;
+		if (flat->ab_ab + flat->ac_ac - 2 * flat->ab_ac <= WIDE * WIDE)
+			continue;
 		struct vec3 middle = vec3_scale(vec3_add(flat->ab, flat->ac), 0.5);
-		if (!nearby_has_segment(nearby, flat->a, vec3_add(flat->a, flat->ab)) ||
-		    !nearby_has_segment(nearby, flat->a, vec3_add(flat->a, flat->ac)) ||
-		    !nearby_has_segment(nearby, flat->a, vec3_add(flat->a, middle)))
+		if (!nearby_has_segment(nearby, flat->a, vec3_add(flat->a, middle)))
 			return false;
 	}
 	return true;

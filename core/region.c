@@ -6,8 +6,8 @@
  *
  * All corners lie in a slab of half the tolerance to both sides, and all triangles face the plane's way in the
  * projection along the dominant axis. So any triangulation of the outline whose triangles face that way too covers
- * the same points as often, and none is moved by more than the tolerance: nothing need be measured. The outline goes
- * to integers by leaving out one coordinate, hence exactly. The triangles are then turned to Delaunay's, as far as
+ * the same points as often, and none is moved by more than the tolerance (smoothed vertices are measured nevertheless).
+ * The outline goes to integers by leaving out one coordinate, hence exactly. The triangles are then turned to Delaunay's, as far as
  * diagonals are allowed: none within a patch face, none that the mesh has elsewhere. */
 #include "core/region.h"
 
@@ -105,9 +105,11 @@ static double height(const struct region_plane *plane, struct vec3 p)
 	return vec3_dot(plane->normal, p) + plane->offset;
 }
 
+/* Smoothing moves vertices, and errors are measured from where they were: both places count. */
 static bool in_slab(const struct grower *g, uint32_t v)
 {
-	return fabs(height(&g->plane, simplify_place(g->s, v))) <= g->slab;
+	return fabs(height(&g->plane, simplify_place(g->s, v))) <= g->slab &&
+	       fabs(height(&g->plane, g->s->origin[v])) <= g->slab;
 }
 
 static void project(const struct grower *g, uint32_t v, int32_t ret_point[2])
@@ -285,16 +287,21 @@ static void make_delaunay(struct grower *g, const uint32_t *slot, uint32_t n)
 	}
 }
 
-/* Gives vertex v, which went, to the triangle over or under it. */
+/* Gives vertex v, which went, to the triangle over or under it; false where that is farther than the tolerance. */
 static bool hand_over(struct grower *g, uint32_t v, const uint32_t *slot, uint32_t n)
 {
 	struct simplify *s = g->s;
 	int32_t p[2], corner[3][2];
 	project(g, v, p);
 	for (uint32_t k = 0; k < n; k++) {
+		const uint32_t *at = &s->mesh.origin[3 * slot[k]];
 		corners(g, slot[k], corner);
 		if (orientation(corner[0], corner[1], p) < 0 || orientation(corner[1], corner[2], p) < 0 ||
 		    orientation(corner[2], corner[0], p) < 0)
+			continue;
+		struct flat flat =
+		    flat_make(simplify_place(s, at[0]), simplify_place(s, at[1]), simplify_place(s, at[2]));
+		if (flat_distance_squared(&flat, s->origin[v]) > s->tolerance_squared)
 			continue;
 		s->next_point[v] = s->points[slot[k]];
 		s->points[slot[k]] = v;
@@ -305,12 +312,18 @@ static bool hand_over(struct grower *g, uint32_t v, const uint32_t *slot, uint32
 
 static void restore(struct grower *g, uint32_t (*before)[3])
 {
+	for (uint32_t k = 0; k < g->n; k++) {
+		if (halfedge_alive(&g->s->mesh, g->taken[k]))
+			halfedge_remove(&g->s->mesh, g->taken[k]);
+		g->s->points[g->taken[k]] = UINT32_MAX;
+	}
 	for (uint32_t k = 0; k < g->n; k++)
 		halfedge_add(&g->s->mesh, g->taken[k], before[k][0], before[k][1], before[k][2]);
 }
 
-/* Replaces the triangles of the region, all removed already, by those of its outline. */
-static void replace(struct grower *g, const struct outline *outline, uint32_t (*triangle)[3], uint32_t n)
+/* Replaces the triangles of the region, all removed already, by those of its outline; false where a vertex that goes
+ * would be too far from them. */
+static bool replace(struct grower *g, const struct outline *outline, uint32_t (*triangle)[3], uint32_t n)
 {
 	struct simplify *s = g->s;
 	const uint32_t *vertex = outline->contour.vertex;
@@ -319,11 +332,9 @@ static void replace(struct grower *g, const struct outline *outline, uint32_t (*
 		             vertex[triangle[k][2]]);
 	make_delaunay(g, g->taken, n);
 	for (uint32_t k = 0; k < g->nv; k++)
-		if (s->mesh.first[g->vertex[k]] == HALFEDGE_NONE) {
-			bool found = hand_over(g, g->vertex[k], g->taken, n);
-			assert(found);
-			(void)found;
-		}
+		if (s->mesh.first[g->vertex[k]] == HALFEDGE_NONE && !hand_over(g, g->vertex[k], g->taken, n))
+			return false;
+	return true;
 }
 
 /* Triangulates the region from its outline. 0; -EDOM where that cannot be, the region is then as before; -ENOMEM. */
@@ -349,10 +360,10 @@ static int flatten(struct grower *g, uint32_t number)
 	const struct polygon polygon = {(const int32_t(*)[2])outline.point, outline.contour.loop_end, outline.contour.n,
 	                                outline.contour.loops};
 	r = triangulate(&polygon, allows, &outline, g->arena, &triangle, &n);
+	if (!r && !replace(g, &outline, triangle, n))
+		r = -EDOM;
 	if (r)
 		restore(g, before);
-	else
-		replace(g, &outline, triangle, n);
 	return r;
 }
 

@@ -269,6 +269,99 @@ static void a_half_unknown_random_field_gets_no_crack(void **state)
 	       (unsigned long long)bench->stats.border_ears, (unsigned long long)bench->stats.border_merged);
 }
 
+static double least(double a, double b)
+{
+	return a < b ? a : b;
+}
+
+static double distance_to_box(const double p[3], const double low[3], const double high[3])
+{
+	double outside = 0, inside = -INFINITY;
+	for (int a = 0; a < 3; a++) {
+		double d = p[a] < low[a] + high[a] - p[a] ? low[a] - p[a] : p[a] - high[a];
+		outside += d > 0 ? d * d : 0;
+		inside = d > inside ? d : inside;
+	}
+	return outside > 0 ? sqrt(outside) : inside;
+}
+
+/* A floor, a cupboard, a table top of one cell, a ball and a slanted wall, in cells. */
+static double world(const double p[3])
+{
+	static const double cupboard[2][3] = {{6.3, 20.2, 0}, {19.6, 33.7, 27.4}};
+	static const double table[2][3] = {{24.2, 5.1, 17.3}, {42.8, 18.4, 18.5}};
+	double x = p[0] - 34.5, y = p[1] - 34.2, z = p[2] - 20.6, d = p[2] - 4.37 - 0.02 * p[0];
+	d = least(d, distance_to_box(p, cupboard[0], cupboard[1]));
+	d = least(d, distance_to_box(p, table[0], table[1]));
+	d = least(d, sqrt(x * x + y * y + z * z) - 7.7);
+	return least(d, 0.8 * p[0] + 0.6 * p[1] - 9.3);
+}
+
+/* The world in a band of three cells, noise of a tenth of a cell, a corner of it never seen. */
+static void fill_world(struct grid *grid, uint64_t *random)
+{
+	for (int k = 0; k < 3 * PATCH_SIDE; k++)
+		for (int j = 0; j < 3 * PATCH_SIDE; j++)
+			for (int i = 0; i < 3 * PATCH_SIDE; i++) {
+				const int at[3] = {i - PATCH_SIDE, j, k};
+				const double p[3] = {i, j, k};
+				double d = world(p) * LATTICE + random_below(random, 51) - 25;
+				bool unknown = fabs(d) > 3 * LATTICE || i + j + k + random_below(random, 4) > 105;
+				set_voxel(grid, at, unknown ? VOXEL_UNKNOWN : (int16_t)d);
+			}
+}
+
+static void a_furnished_world_of_27_patches_is_sound_and_within_its_bounds(void **state)
+{
+	struct bench *bench = *state;
+	uint64_t seed = 11;
+	for (int noise = 0; noise < 2; noise++) {
+		struct grid *grid = grid_create(64 << 20);
+		fill_world(grid, &seed);
+		bench->faces_raw = bench->faces = 0;
+		reduce_all(bench, grid, 0.25);
+		assert_true(bench->faces_raw > 10000);
+		assert_true(bench->faces * 100 < bench->faces_raw * 12);
+		check_topology(bench);
+		check_distance(bench, 0.25);
+		grid_destroy(grid);
+	}
+	assert_int_equal(bench->stats.border_merged, 0);
+	printf("note: world of 27 patches: %llu of %llu faces\n", (unsigned long long)bench->faces,
+	       (unsigned long long)bench->faces_raw);
+}
+
+static void the_order_of_patches_and_what_was_before_do_not_matter(void **state)
+{
+	struct bench *bench = *state;
+	struct grid *grid = grid_create(64 << 20);
+	const struct patch_key *keys;
+	const struct reduce_params params = {.tolerance = 0.25};
+	uint64_t seed = 12, hash[2][216];
+	fill_world(grid, &seed);
+	size_t n = grid_take_dirty(grid, &keys);
+	assert_true(n <= 216);
+	for (int backwards = 0; backwards < 2; backwards++)
+		for (size_t k = 0; k < n; k++) {
+			size_t i = backwards ? n - 1 - k : k;
+			struct surface raw, reduced;
+			if (!backwards)
+				arena_reset(&bench->arena);
+			cubes_gather(grid, keys[i], &bench->window);
+			assert_int_equal(cubes_extract(&bench->window, &bench->arena, &raw), 0);
+			assert_int_equal(
+			    reduce_surface(&bench->window, &raw, &params, &bench->arena, &bench->stats, &reduced), 0);
+			uint64_t h = reduced.nt;
+			for (uint32_t t = 0; t < reduced.nt; t++)
+				for (int c = 0; c < 3; c++)
+					for (int a = 0; a < 3; a++)
+						h = soup_mix(h + reduced.vertex[reduced.triangle[t][c]][a]);
+			hash[backwards][i] = h;
+		}
+	assert_memory_equal(hash[0], hash[1], n * sizeof hash[0][0]);
+	grid_destroy(grid);
+}
+
 static int create(void **state)
 {
 	struct bench *bench = calloc(1, sizeof *bench);
@@ -293,6 +386,8 @@ int main(void)
 	    cmocka_unit_test(a_closed_random_field_across_patches_stays_closed),
 	    cmocka_unit_test(a_random_field_with_rims_gets_no_other_rims),
 	    cmocka_unit_test(a_half_unknown_random_field_gets_no_crack),
+	    cmocka_unit_test(a_furnished_world_of_27_patches_is_sound_and_within_its_bounds),
+	    cmocka_unit_test(the_order_of_patches_and_what_was_before_do_not_matter),
 	};
 	return cmocka_run_group_tests(tests, create, destroy);
 }

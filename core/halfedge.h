@@ -57,7 +57,7 @@ int halfedge_build(const struct surface *surface, uint32_t spare, struct arena *
 uint32_t halfedge_find(const struct halfedge_mesh *mesh, uint32_t a, uint32_t b);
 bool halfedge_joined(const struct halfedge_mesh *mesh, uint32_t a, uint32_t b); /* in either direction */
 
-/* The half-edge without a twin that leaves v (into_v: that ends in v), or HALFEDGE_NONE. The first one at a touching vertex. */
+/* The half-edge without a twin that leaves v (or ends in v), or HALFEDGE_NONE. The first one at a touching vertex. */
 uint32_t halfedge_border_from(const struct halfedge_mesh *mesh, uint32_t v);
 uint32_t halfedge_border_into(const struct halfedge_mesh *mesh, uint32_t v);
 uint32_t halfedge_valence(const struct halfedge_mesh *mesh, uint32_t v); /* triangles at v */

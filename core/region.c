@@ -1,14 +1,14 @@
 /* Regions grow over the mesh, from where it is densest in flat vertices.
  *
- * Bins of 4 cells are tried by the number of their vertices: a plane is fitted to a bin, and from one of its triangles on the
- * region takes every neighbour whose three corners lie in the slab about the plane and whose normal is within 60
+ * Bins of 4 cells are tried by the number of their vertices: a plane is fitted to a bin, and from one of its
+ * triangles on the region takes every neighbour whose three corners lie in the slab about the plane and whose normal is within 60
  * degrees of the plane's. The plane is then fitted to what it took, and it grows once more.
  *
  * All corners lie in a slab of half the tolerance to both sides, and all triangles face the plane's way in the
  * projection along the dominant axis. So any triangulation of the outline whose triangles face that way too covers
  * the same points as often, and none is moved by more than the tolerance (smoothed vertices are measured nevertheless).
- * The outline goes to integers by leaving out one coordinate, hence exactly. The triangles are then turned to Delaunay's, as far as
- * diagonals are allowed: none within a patch face, none that the mesh has elsewhere. */
+ * The outline goes to integers by leaving out one coordinate, hence exactly. The triangles are then turned to Delaunay's,
+ * as far as diagonals are allowed: none within a patch face, none that the mesh has elsewhere. */
 #include "core/region.h"
 
 #include <assert.h>

@@ -452,8 +452,8 @@ static void commit(struct pass *pass, uint32_t v, uint32_t u, uint32_t h, bool r
 	}
 }
 
-/* Whether the new edges of u, and the middles of new triangles that are wide, run where the raw surface was. Each new edge is
- * the first side of one of the triangles. */
+/* Whether the new edges of u, and the middles of new triangles that are wide, run where the raw surface was. Each new
+ * edge is the first side of one of the triangles. */
 static bool flats_stay_near(const struct pass *pass)
 {
 	const struct nearby *nearby = &pass->s->nearby;

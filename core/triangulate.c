@@ -1,12 +1,12 @@
 /* Holes are joined to the outer loop by bridges, then ears are cut.
  *
  * The ring is a doubly linked list of places; a place names a point. A hole is joined at its leftmost point, holes
- * from left to right: where the ring has a place at the same coordinates the two loops are spliced there; else by a bridge to
- * the nearest place that sees it, which doubles both ends. So the ring is a polygon that may touch itself.
+ * from left to right: where the ring has a place at the same coordinates the two loops are spliced there; else by
+ * a bridge to the nearest place that sees it, which doubles both ends. So the ring is a polygon that may touch itself.
  *
  * An ear is a place with a left turn whose diagonal lies strictly inside the angles at both its ends and whose closed
- * triangle holds no other place, places at its own three corners excepted. The angles decide what places with equal coordinates
- * cannot: on which side of a touching corner the diagonal runs. Only places without a left turn need be looked at: of the
+ * triangle holds no other place, places at its own three corners excepted. The angles decide what places with equal
+ * coordinates cannot: on which side of a touching corner the diagonal runs. Only places without a left turn need be looked at: of the
  * places inside, the nearest to the tip is one. They lie in a grid of buckets, so that an ear looks at those near it and the
  * whole takes about linear time.
  *

@@ -48,8 +48,8 @@ size_t framer_push(struct framer *, const uint8_t *bytes, size_t len);
 size_t framer_take(struct framer *, const uint8_t **ret_telegram);
 
 /* Nothing came for long; what is pushed from here on came after a silence. A telegram that was begun before is still taken when
- * these bytes make it whole (it was the host that slept), else it is refused, so that what stands behind it is not
- * held up; the silence is a boundary, too. */
+ * the next push makes it whole (it was the host that slept, and the line kept the rest), else it is refused, so that what
+ * stands behind it is not held up; the silence is a boundary, too. */
 void framer_silence(struct framer *);
 
 #endif

@@ -23,7 +23,7 @@
 
 #define COSINE_TURN  0.30901699437494742 /* 72 degrees */
 #define VALENCE_MAX  24
-#define FLATS_MAX    256             /* triangles at a vertex before that */
+#define FLATS_MAX    32              /* triangles of a vertex that may go: with more, VALENCE_MAX refuses it */
 #define RIM_SIDEWAYS 0.5             /* cells */
 #define RIM_GAP      5               /* lattice units a rim vertex keeps from other rim edges, 0.02 cell */
 #define ERROR_SHARE  0.1             /* of the sum of squared distances, in the cost */
@@ -262,6 +262,7 @@ static void make_flats(struct pass *pass, uint32_t v, uint32_t u, uint32_t h)
 {
 	const struct simplify *s = pass->s;
 	const struct halfedge_mesh *mesh = &s->mesh;
+	assert(halfedge_valence(mesh, v) <= FLATS_MAX);
 	pass->flats = 0;
 	HALFEDGE_EACH(mesh, e, v)
 	{

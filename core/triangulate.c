@@ -22,6 +22,7 @@
 
 #define NONE         UINT32_MAX
 #define BUCKETS_SIDE 64 /* at most, a side */
+#define BRIDGE_TRIES 16 /* points of a hole; one that finds no bridge is rare */
 
 struct ring {
 	const int32_t (*point)[2];
@@ -156,7 +157,8 @@ static bool join_hole(struct ring *ring, uint32_t outer, uint32_t first)
 		}
 		p = ring->next[p];
 	} while (p != first);
-	do { /* from any of its points, the leftmost first */
+	uint32_t tries = 0;
+	do { /* from one of its points, the leftmost first */
 		int64_t distance = 0, next_distance;
 		for (uint32_t to = next_nearest(ring, outer, hole, 0, NONE, &next_distance); to != NONE;
 		     to = next_nearest(ring, outer, hole, distance, to, &next_distance)) {
@@ -167,7 +169,7 @@ static bool join_hole(struct ring *ring, uint32_t outer, uint32_t first)
 			}
 		}
 		hole = ring->next[hole];
-	} while (hole != first);
+	} while (hole != first && ++tries < BRIDGE_TRIES);
 	return false;
 }
 

@@ -37,6 +37,7 @@
 #define SINUS_FLOOR   0.05 /* of the peak speed */
 #define SINUS_CHANGE  0.1  /* a new speed is sent when it differs by so much of the present one */
 #define REST_GRACE_NS 2000000000
+#define REST_MAX_S    60.0
 
 enum phase { WRITING, RUNNING, STOPPING, STOPPED, FAILED };
 enum wish { WISH_NONE, WISH_INITIAL, WISH_SPEED, WISH_TARGET };
@@ -417,6 +418,7 @@ static double within(const struct dialogue *d, double angle_rad)
 void modbus_dialogue_stop(struct dialogue *d, int64_t t_ns)
 {
 	double speed = d->peak_rad_s > 0.0 ? d->peak_rad_s : 10.0 * TRIG_DEG;
+	double way_s;
 
 	if (d->phase == FAILED || d->phase == STOPPED)
 		return;
@@ -427,8 +429,9 @@ void modbus_dialogue_stop(struct dialogue *d, int64_t t_ns)
 	d->phase = STOPPING;
 	d->speed_due = d->device.speed.set && d->speed_rad_s != d->peak_rad_s;
 	d->speed_rad_s = d->peak_rad_s;
-	d->stop_by_ns = t_ns + REST_GRACE_NS;
-	if (d->has_rest)
-		d->stop_by_ns += (int64_t)(fabs(d->angle_rad - d->rest_rad) / speed * 1e9);
+	way_s = d->has_rest ? fabs(d->angle_rad - d->rest_rad) / speed : 0.0;
+	if (!(way_s < REST_MAX_S)) /* a float register may say any angle */
+		way_s = REST_MAX_S;
+	d->stop_by_ns = t_ns + REST_GRACE_NS + (int64_t)(way_s * 1e9);
 	go(d, d->has_rest ? d->rest_rad : within(d, d->angle_rad));
 }

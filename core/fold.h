@@ -10,6 +10,8 @@
 #define WEIGHT_KNOWN    4      /* least weight of a known voxel */
 #define WEIGHT_MAX      16384  /* the cap: sum and weight are scaled down to it together */
 #define PUBLISH_STEP    16     /* 1/256 cell: a lesser change is no news */
+#define TOUCHING        24     /* 1/256 cell: a mean no farther behind a surface is published as 0, on it */
+#define TOUCHING_STICKS 8      /* more on the side where a voxel is, less where it is not yet */
 #define FREE_WEIGHT     32     /* what one ray takes from a voxel it passes through */
 #define FOLD_BLOCKS_MAX 4096   /* blocks of one row (34 MB); when they are full the row is folded in parts */
 #define FOLD_RAYS_MAX   65536  /* distinct rays of one row; rays beyond are not looked at */

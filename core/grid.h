@@ -3,7 +3,8 @@
  *
  * Corner (voxel) i,j,k lies at (i,j,k) * cell. Block = i >> 3, patch = i >> 4 (interfaces, section 2).
  * A voxel keeps integer sums, never a running average, and the value it has *published* to meshes: the fold takes the
- * new mean over into `published` only when it differs by at least 1/16 cell or when known becomes unknown or back. */
+ * new mean over into `published` only when it differs by at least 1/16 cell or when known becomes unknown or back. A mean
+ * hardly behind a surface (TOUCHING in fold.h) is published as 0, on it. */
 #ifndef FACET_CORE_GRID_H
 #define FACET_CORE_GRID_H
 

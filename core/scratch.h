@@ -40,8 +40,15 @@ struct fold {
 	struct fold_stats stats;
 };
 
-/* The accumulators of a block; NULL when scratch or memory is full. */
-struct scratch_block *scratch_touch(struct fold *, int32_t x, int32_t y, int32_t z);
+/* The accumulators of a block; NULL when scratch or memory is full. scratch_seek looks beyond the recent ones. */
+struct scratch_block *scratch_seek(struct fold *, int32_t x, int32_t y, int32_t z);
+
+static inline struct scratch_block *scratch_touch(struct fold *fold, int32_t x, int32_t y, int32_t z)
+{
+	struct scratch_block *b = fold->recent[(x & 1) | (y & 1) << 1 | (z & 1) << 2];
+
+	return b && b->key.x == x && b->key.y == y && b->key.z == z ? b : scratch_seek(fold, x, y, z);
+}
 
 /* Walks every ray through the blocks that exist and marks the voxels it may clear; no ray is left. */
 void rays_walk(struct fold *);

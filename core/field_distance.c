@@ -334,12 +334,10 @@ int field_flush(struct field *field)
 
 void field_point(struct field *field, struct vec3 origin, struct vec3 point)
 {
-	const double limit = 4194288.0; /* cells, as for rasters */
 	double scale = 1 / field->params.cell_m;
 	struct vec3 p = vec3_scale(point, scale), o = vec3_scale(origin, scale);
 
-	if (!(fabs(p.x) < limit && fabs(p.y) < limit && fabs(p.z) < limit && fabs(o.x) < limit && fabs(o.y) < limit &&
-	      fabs(o.z) < limit)) {
+	if (!raster_within_map(p) || !raster_within_map(o)) {
 		field->stats.far_points++;
 		return;
 	}

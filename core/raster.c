@@ -11,15 +11,14 @@
 #include <stdlib.h>
 #include <string.h>
 
-#define JOIN_SLOPE      0.085
-#define JOIN_FLOOR_M    0.01
-#define JOIN_MAX_M      0.6
-#define FLAT_SINE2      0.004866 /* sin(4 degrees)^2 */
-#define RUN_MAX         15
-#define MARGIN          8          /* columns kept free on either side for rows that begin earlier or end later */
-#define COLUMN_SLACK    (1.0 / 64) /* of a step: rounding of a bearing must not move its column */
-#define MOMENT_UNITS_M  8000.0
-#define MAP_LIMIT_CELLS 4194288.0 /* 2^18 patches of 16 cells, less one for the band */
+#define JOIN_SLOPE     0.085
+#define JOIN_FLOOR_M   0.01
+#define JOIN_MAX_M     0.6
+#define FLAT_SINE2     0.004866 /* sin(4 degrees)^2 */
+#define RUN_MAX        15
+#define MARGIN         8          /* columns kept free on either side for rows that begin earlier or end later */
+#define COLUMN_SLACK   (1.0 / 64) /* of a step: rounding of a bearing must not move its column */
+#define MOMENT_UNITS_M 8000.0
 
 void raster_init(struct raster *raster, double cell_m)
 {
@@ -117,11 +116,6 @@ struct raster_line *raster_line(struct raster *raster, uint64_t number)
 	return &raster->line[number % RASTER_LINES];
 }
 
-static bool within_map(struct vec3 cells)
-{
-	return fabs(cells.x) < MAP_LIMIT_CELLS && fabs(cells.y) < MAP_LIMIT_CELLS && fabs(cells.z) < MAP_LIMIT_CELLS;
-}
-
 static void points_place(const struct raster *raster, struct raster_line *line)
 {
 	const struct row *row = line->row;
@@ -133,7 +127,8 @@ static void points_place(const struct raster *raster, struct raster_line *line)
 		struct vec3 p = vec3_scale(beam->point, scale);
 		int32_t c = line->first + (int32_t)k;
 
-		if (beam->state != BEAM_OK || !within_map(p) || !within_map(vec3_scale(beam->origin, scale)))
+		if (beam->state != BEAM_OK || !raster_within_map(p) ||
+		    !raster_within_map(vec3_scale(beam->origin, scale)))
 			continue;
 		line->point[c] = p;
 		line->flags[c] = RASTER_POINT;

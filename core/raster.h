@@ -76,6 +76,14 @@ struct raster_line *raster_line(struct raster *, uint64_t number);
 /* Computes the normals of a line from a window that ends at line `last`, at most RASTER_LOOKAHEAD after it. */
 void raster_normals(struct raster *, uint64_t number, uint64_t last);
 
+/* Within 2^18 patches of the origin, less one for the band; false for what is no number. */
+static inline bool raster_within_map(struct vec3 cells)
+{
+	const double limit = 16.0 * ((1 << 18) - 1);
+
+	return fabs(cells.x) < limit && fabs(cells.y) < limit && fabs(cells.z) < limit;
+}
+
 /* The beam behind a column, or NULL. */
 static inline const struct row_beam *raster_beam(const struct raster_line *line, int32_t column)
 {

@@ -10,7 +10,7 @@
 #include "core/predicates.h"
 
 #define STEP_SHARE  0.7                 /* of the way to the mean */
-#define STEP_MAX    (0.12 * LATTICE)    /* lattice units */
+#define STEP_MAX    0.48                /* of the tolerance: 0.12 cell where that is a quarter */
 #define COSINE_TURN 0.70710678118654752 /* 45 degrees, per step of one corner */
 #define INSIDE_MIN  2                   /* lattice units an inner vertex keeps from the faces of the patch */
 
@@ -60,8 +60,9 @@ static struct vec3 target_of(const struct simplify *s, uint32_t v)
 	double length = vec3_norm(normal);
 	if (length == 0)
 		return at;
+	double most = STEP_MAX * sqrt(s->tolerance_squared);
 	double step = STEP_SHARE * vec3_dot(sum, normal) / (n * length);
-	step = step > STEP_MAX ? STEP_MAX : step < -STEP_MAX ? -STEP_MAX : step;
+	step = step > most ? most : step < -most ? -most : step;
 	return vec3_add(at, vec3_scale(normal, step / length));
 }
 

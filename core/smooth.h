@@ -4,8 +4,8 @@
 
 #include "core/simplify.h"
 
-/* Moves inner vertices along their normals towards the mean of their neighbours, at most 0.12 cell, to lattice points that
- * no other vertex has. 0 or -ENOMEM. */
+/* Moves inner vertices along their normals towards the mean of their neighbours, at most half the tolerance, to lattice
+ * points that no other vertex has. 0 or -ENOMEM. */
 int smooth_step(struct simplify *s, struct arena *arena);
 
 #endif

@@ -18,9 +18,11 @@
 
 #include "core/native.h"
 
-#define CLIENTS   4
-#define QUIET_S   4   /* no new step for so long, and everyone at the same one: the end */
-#define LIMIT_S   150 /* then it has failed */
+#define CLIENTS 4
+#define QUIET_S 4   /* no new step for so long, and everyone at the same one: the end */
+#define LIMIT_S 150 /* then it has failed */
+#define MISSED \
+	(20 * 16384) /* bytes that the stall lasts for at least: twenty send buffers of the daemon's configuration */
 #define STEPS_MAX 100000
 
 struct client {
@@ -36,12 +38,13 @@ struct client {
 struct test {
 	const char *unix_path, *dir;
 	int port;
-	double join_s, stall_s, stall_end_s;
+	double join_s, stall_s, stall_for_s;
+	size_t missed;      /* bytes that the first client got since the stall began */
+	bool stalled, over; /* the stall began; it ended */
 	struct client client[CLIENTS];
 	char (*hash)[65]; /* [STEPS_MAX] of the mesh of each step, as first seen */
 	uint64_t newest;
 	double newest_at_s;
-	bool asked;
 };
 
 static double now_s(void)
@@ -156,10 +159,12 @@ static void receive(struct test *t, struct client *c)
 	if (n <= 0)
 		fail(c->name, n ? strerror(errno) : "closed by the server");
 	c->len += (size_t)n;
+	if (c == &t->client[0] && t->stalled)
+		t->missed += (size_t)n;
 	feed(t, c);
 }
 
-/* The server's own word that somebody is behind, shortly before the stall ends. */
+/* The server's own word that somebody is behind, just before the stall ends. */
 static void keep_status(struct test *t)
 {
 	char path[512];
@@ -180,12 +185,24 @@ static void keep_status(struct test *t)
 	FILE *f = fopen(path, "w");
 	if (!f || fwrite(text, 1, len, f) != len || fclose(f) != 0)
 		fail(path, strerror(errno));
-	t->asked = true;
+}
+
+/* The stall lasts its time, and until so much has changed that it means something. */
+static bool stalling(struct test *t, double s)
+{
+	if (s < t->stall_s || t->over)
+		return false;
+	t->stalled = true;
+	if (s < t->stall_s + t->stall_for_s || t->missed < MISSED)
+		return true;
+	keep_status(t);
+	t->over = true;
+	return false;
 }
 
 static bool ended(const struct test *t, double s)
 {
-	if (s < t->stall_end_s + 1 || now_s() - t->newest_at_s < QUIET_S)
+	if (!t->over || now_s() - t->newest_at_s < QUIET_S)
 		return false;
 	for (int i = 0; i < CLIENTS; i++)
 		if (!t->client[i].mirror || native_mirror_step(t->client[i].mirror) != t->newest)
@@ -198,7 +215,7 @@ static void run(struct test *t)
 	double start = now_s();
 	for (;;) {
 		double s = now_s() - start;
-		bool stall = s >= t->stall_s && s < t->stall_end_s;
+		bool stall = stalling(t, s);
 		struct pollfd p[CLIENTS];
 		for (int i = 0; i < CLIENTS; i++) {
 			struct client *c = &t->client[i];
@@ -206,8 +223,6 @@ static void run(struct test *t)
 				join(t, c);
 			p[i] = (struct pollfd){c->mirror && !(stall && c->stalls) ? c->fd : -1, POLLIN, 0};
 		}
-		if (stall && s > t->stall_end_s - 1 && !t->asked)
-			keep_status(t);
 		if (ended(t, s))
 			return;
 		if (s > LIMIT_S)
@@ -230,7 +245,7 @@ int main(int argc, char **argv)
 	                 .dir = argv[3],
 	                 .join_s = atof(argv[4]),
 	                 .stall_s = atof(argv[5]),
-	                 .stall_end_s = atof(argv[5]) + atof(argv[6]),
+	                 .stall_for_s = atof(argv[6]),
 	                 .client = {{.name = "reads everything"},
 	                            {.name = "stalls, unix", .stalls = true},
 	                            {.name = "stalls, tcp", .tcp = true, .stalls = true},

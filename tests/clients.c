@@ -200,7 +200,7 @@ static bool stalling(struct test *t, double s)
 	return false;
 }
 
-static bool ended(const struct test *t, double s)
+static bool ended(const struct test *t)
 {
 	if (!t->over || now_s() - t->newest_at_s < QUIET_S)
 		return false;
@@ -223,7 +223,7 @@ static void run(struct test *t)
 				join(t, c);
 			p[i] = (struct pollfd){c->mirror && !(stall && c->stalls) ? c->fd : -1, POLLIN, 0};
 		}
-		if (ended(t, s))
+		if (ended(t))
 			return;
 		if (s > LIMIT_S)
 			fail("the end", "the clients did not all come to the same step");

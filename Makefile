@@ -6,6 +6,7 @@ CC_release := $(CC)
 endif
 PREFIX ?= /usr/local
 DESTDIR ?=
+Q := $(if $(V),,@) # make V=1 shows the commands
 
 ifeq ($(config),release)
 B := build
@@ -46,6 +47,7 @@ DAEMON := $(filter-out daemon/facetd.c,$(wildcard daemon/*.c))
 TOOLS := $(filter-out tools/facet.c,$(wildcard tools/*.c))
 TESTS := $(patsubst tests/%.c,%,$(wildcard tests/test_*.c))
 PROGRAMS := clients steps
+THREADED := test_worker test_server test_replay test_modbus test_sim_servo test_client
 FUZZ := $(patsubst tests/%.c,%,$(wildcard tests/fuzz_*.c))
 LIBRARIES := $(B)/libtools.a $(B)/libdaemon.a $(B)/libdrivers.a $(B)/libconfig.a $(B)/libcore.a
 
@@ -66,7 +68,8 @@ needed:
 
 $(B)/obj/%.o: %.c Makefile | needed
 	@mkdir -p $(@D)
-	$(CC) $(CFLAGS_ALL) -DFACET_VERSION='"$(VERSION)"' -c -o $@ $<
+	@echo '  CC   $<'
+	$(Q)$(CC) $(CFLAGS_ALL) -DFACET_VERSION='"$(VERSION)"' -c -o $@ $<
 
 $(B)/libcore.a: $(call objects,$(CORE))
 $(B)/libconfig.a: $(call objects,$(CONFIG))
@@ -76,21 +79,26 @@ $(B)/libtools.a: $(call objects,$(TOOLS))
 $(B)/lib%.a:
 	@mkdir -p $(@D)
 	@rm -f $@
-	ar rcs $@ $^
+	$(Q)ar rcs $@ $^
 
 $(B)/facetd: $(B)/obj/daemon/facetd.o $(filter-out $(B)/libtools.a,$(LIBRARIES))
-	$(CC) $(LDFLAGS_ALL) -o $@ $^ $(LIBS)
+	@echo '  LD   $@'
+	$(Q)$(CC) $(LDFLAGS_ALL) -o $@ $^ $(LIBS)
 $(B)/facet: $(B)/obj/tools/facet.o $(LIBRARIES)
-	$(CC) $(LDFLAGS_ALL) -o $@ $^ $(LIBS)
+	@echo '  LD   $@'
+	$(Q)$(CC) $(LDFLAGS_ALL) -o $@ $^ $(LIBS)
 $(B)/tests/test_%: $(B)/obj/tests/test_%.o $(LIBRARIES)
 	@mkdir -p $(@D)
-	$(CC) $(LDFLAGS_ALL) -o $@ $^ $(LIBS) -lcmocka
+	@echo '  LD   $@'
+	$(Q)$(CC) $(LDFLAGS_ALL) -o $@ $^ $(LIBS) -lcmocka
 $(addprefix $(B)/tests/,$(PROGRAMS)): $(B)/tests/%: $(B)/obj/tests/%.o $(LIBRARIES)
 	@mkdir -p $(@D)
-	$(CC) $(LDFLAGS_ALL) -o $@ $^ $(LIBS)
+	@echo '  LD   $@'
+	$(Q)$(CC) $(LDFLAGS_ALL) -o $@ $^ $(LIBS)
 $(B)/tests/fuzz_%: $(B)/obj/tests/fuzz_%.o $(LIBRARIES)
 	@mkdir -p $(@D)
-	$(CC) $(LDFLAGS_ALL) -fsanitize=fuzzer -o $@ $^ $(LIBS)
+	@echo '  LD   $@'
+	$(Q)$(CC) $(LDFLAGS_ALL) -fsanitize=fuzzer -o $@ $^ $(LIBS)
 
 # Purposes are installed first and the build starts in a second make, whose pkg-config then knows them.
 check:
@@ -98,6 +106,11 @@ check:
 	@$(MAKE) --no-print-directory config=$(config) run-check
 run-check: all tests
 	@tests/run $(B)
+ifeq ($(config),sanitize)
+	@$(MAKE) --no-print-directory config=thread all $(addprefix build/thread/tests/,$(THREADED))
+	@echo 'under ThreadSanitizer:'
+	@tests/run build/thread $(addprefix build/thread/tests/,$(THREADED))
+endif
 
 demo:
 	@tools/deps build

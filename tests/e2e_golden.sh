@@ -1,5 +1,5 @@
 #!/bin/sh
-# Law L2: gcc and clang, -O0 to -O3 with wider instructions, another libm choice and another machine: the same bytes.
+# Laws L2, L4: gcc and clang, -O0 to -O3 with wider instructions, another libm choice and another machine: the same bytes.
 set -eu
 golden=$(cat tests/golden.txt)
 scan=../shared/data/kurt3d/scan000.3d
@@ -15,7 +15,7 @@ try() { # NAME RUNNER COMPILER OPTION...
     got=$($runner "$out/golden")
     [ "$got" = "$golden" ] || { echo "$name: $got, not $golden"; status=1; }
     if [ -f "$scan" ]; then
-        real=$($runner "$out/golden" "$scan")
+        real=$($runner "$out/golden" 0 "$scan")
         [ "$real" = "${first:=$real}" ] || { echo "$name on a real sweep: $real, not $first"; status=1; }
     fi
     count=$((count + 1))
@@ -23,6 +23,17 @@ try() { # NAME RUNNER COMPILER OPTION...
 
 try "gcc -O2" "" gcc -O2
 GLIBC_TUNABLES=glibc.cpu.hwcaps=-AVX2,-FMA "$out/golden" | grep -qxF "$golden" || { echo "another libm choice: other bytes"; status=1; }
+
+# Meshed every row, every 4 or 10 rows, or once: the same patches (dirty patches are all that changed).
+if [ -f "$scan" ]; then
+    all=$("$out/golden" 0 "${scan%0.3d}0.3d" "${scan%0.3d}1.3d" "${scan%0.3d}2.3d")
+    for rows in 1 4 10; do
+        some=$("$out/golden" $rows "${scan%0.3d}0.3d" "${scan%0.3d}1.3d" "${scan%0.3d}2.3d")
+        [ "$some" = "$all" ] || { echo "$rows rows a commit: $some, not $all"; status=1; }
+    done
+    echo "note: 1, 4, 10 rows a commit and all at once: $all"
+fi
+
 try "gcc -O0" "" gcc -O0
 if grep -q avx2 /proc/cpuinfo && grep -q fma /proc/cpuinfo; then
     try "gcc -O3 x86-64-v3" "" gcc -O3 -march=x86-64-v3

@@ -1,7 +1,8 @@
 /* Law L2: the same rows give the same bytes, whatever compiler, option or machine. Prints the hash of the map of a made-up
  * drive through a room with a column; tests/e2e_golden.sh builds it in many ways and compares.
  *
- *   golden [SCAN.3d]     with a file: the map of that sweep (fixed pose) instead */
+ *   golden [ROWS [SCAN.3d...]]     ROWS a commit (0: meshed once, at the end); with files: the map of these sweeps instead,
+ *                                  each at the pose beside it */
 #include <stdio.h>
 #include <stdlib.h>
 #include <string.h>
@@ -17,8 +18,18 @@
 struct run {
 	struct map *map;
 	struct sweep *sweep;
-	uint64_t rows;
+	struct mesher *mesher;
+	struct patch_store *store;
+	uint64_t rows, rows_a_commit;
 };
+
+static void commit(struct run *run)
+{
+	const struct patch_key *dirty;
+	size_t n = map_take_dirty(run->map, &dirty);
+	for (size_t i = 0; i < n; i++)
+		patch_store_put(run->store, map_mesh_patch(run->map, run->mesher, dirty[i], NULL));
+}
 
 static struct vec3 in_plane(double bearing_rad)
 {
@@ -80,14 +91,22 @@ static void drain(struct run *run, int64_t log_ns, bool end)
 			continue;
 		row->number = run->rows++;
 		map_row(run->map, row);
+		if (run->rows_a_commit && run->rows % run->rows_a_commit == 0)
+			commit(run);
 	}
 }
 
 /* Two half sweeps, down and up again, while the robot creeps forward and turns a little. */
-static void drive(struct run *run, const struct sweep_params *params)
+static void drive(struct run *run)
 {
+	struct sweep_params params = {.base_tilt = transform_rpy((struct vec3){0.2, 0, 0.1}, (struct vec3){0, 0.01, 0}),
+	                              .tilt_laser = transform_rpy((struct vec3){0, 0, 0.05}, (struct vec3){0, 0, 0}),
+	                              .range_min_m = 0.3,
+	                              .range_max_m = 30,
+	                              .hold_ns = 30000000};
 	static struct profile p;
 	uint32_t noise = 1;
+	run->sweep = sweep_create(&params);
 	for (int i = 0; i < 240; i++) {
 		int64_t t = (int64_t)i * 2 * TURN_NS;
 		double tilt_rad = (i < 120 ? i : 240 - i) * 0.5 * TRIG_DEG - 25 * TRIG_DEG;
@@ -102,24 +121,45 @@ static void drive(struct run *run, const struct sweep_params *params)
 		                     .n = BEAMS,
 		                     .first_rad = -90 * TRIG_DEG,
 		                     .step_rad = 0.5 * TRIG_DEG};
-		measure(&p, params, tilt_rad, &pose, &noise);
+		measure(&p, &params, tilt_rad, &pose, &noise);
 		sweep_profile(run->sweep, &p, t + 2 * TURN_NS);
 		drain(run, t, false);
 	}
+	drain(run, INT64_MAX / 2, true);
+	map_flush(run->map);
+	sweep_destroy(run->sweep);
 }
 
-static int play(struct run *run, const char *path)
+/* The whole file in memory that stays; its length, 0 where it is not there. */
+static size_t read_file(const char *path, uint8_t *ret, size_t cap)
 {
 	FILE *f = fopen(path, "rb");
-	static uint8_t data[4 << 20];
-	static struct profile p;
-	size_t len = f ? fread(data, 1, sizeof data, f) : 0;
-	struct uos_scan scan;
-	struct parse_error error;
+	size_t len = f ? fread(ret, 1, cap, f) : 0;
 	if (f)
 		fclose(f);
-	if (!len || uos_read(data, len, &scan, &error) < 0)
+	return len;
+}
+
+static int read_sweep(const char *path, struct uos_scan *ret, struct transform *ret_pose)
+{
+	static uint8_t data[4 << 20];
+	char beside[512];
+	struct parse_error error;
+	size_t len = read_file(path, data, sizeof data);
+	if (!len || uos_read(data, len, ret, &error) < 0)
 		return -1;
+	snprintf(beside, sizeof beside, "%.*s.pose", (int)strlen(path) - 3, path);
+	len = read_file(beside, data, sizeof data);
+	return len ? uos_read_pose((char *)data, len, ret_pose, &error) : -1;
+}
+
+static int play(struct run *run, struct sweep_params *params, const char *path)
+{
+	static struct profile p;
+	struct uos_scan scan;
+	if (read_sweep(path, &scan, &params->map_base) < 0)
+		return -1;
+	run->sweep = sweep_create(params);
 	for (uint32_t i = 0; i < scan.rows; i++) {
 		const struct uos_row *r = &scan.row[i];
 		int64_t t = (int64_t)i * 4 * TURN_NS;
@@ -139,6 +179,9 @@ static int play(struct run *run, const char *path)
 		drain(run, t + 3 * TURN_NS, false);
 	}
 	uos_finish(&scan);
+	drain(run, INT64_MAX / 2, true);
+	map_flush(run->map);
+	sweep_destroy(run->sweep);
 	return 0;
 }
 
@@ -146,33 +189,26 @@ int main(int argc, char **argv)
 {
 	struct map_params map_params = {
 	    .cell_m = 0.05, .tolerance = 0.25, .reduce = true, .lookahead = 2, .memory = 256 << 20};
-	struct sweep_params params = {.base_tilt = transform_rpy((struct vec3){0.2, 0, 0.1}, (struct vec3){0, 0.01, 0}),
-	                              .tilt_laser = transform_rpy((struct vec3){0, 0, 0.05}, (struct vec3){0, 0, 0}),
-	                              .range_min_m = 0.3,
-	                              .range_max_m = 30,
-	                              .hold_ns = 30000000};
-	if (argc > 1) {
-		params.base_tilt = params.tilt_laser = params.map_base = transform_identity();
-		params.fixed_pose = true;
-	}
-	struct run run = {map_create(&map_params), sweep_create(&params), 0};
-	if (argc > 1 && play(&run, argv[1]) < 0) {
-		fprintf(stderr, "golden: cannot read %s\n", argv[1]);
-		return 1;
-	}
-	if (argc == 1)
-		drive(&run, &params);
-	drain(&run, INT64_MAX / 2, true);
-	map_flush(run.map);
-
-	const struct patch_key *dirty;
-	size_t n = map_take_dirty(run.map, &dirty);
-	struct mesher *mesher = mesher_create();
-	struct patch_store *store = patch_store_create();
-	for (size_t i = 0; i < n; i++)
-		patch_store_put(store, map_mesh_patch(run.map, mesher, dirty[i], NULL));
+	struct sweep_params still = {.base_tilt = transform_identity(),
+	                             .tilt_laser = transform_identity(),
+	                             .fixed_pose = true,
+	                             .range_min_m = 0.3,
+	                             .range_max_m = 30,
+	                             .hold_ns = 30000000};
+	struct run run = {.map = map_create(&map_params),
+	                  .mesher = mesher_create(),
+	                  .store = patch_store_create(),
+	                  .rows_a_commit = argc > 1 ? strtoull(argv[1], NULL, 10) : 0};
+	for (int i = 2; i < argc; i++)
+		if (play(&run, &still, argv[i]) < 0) {
+			fprintf(stderr, "golden: cannot read %s\n", argv[i]);
+			return 1;
+		}
+	if (argc <= 2)
+		drive(&run);
+	commit(&run);
 	char hash[65];
-	patch_store_hash(store, hash);
-	printf("%s %zu patches %llu rows\n", hash, patch_store_count(store), (unsigned long long)run.rows);
+	patch_store_hash(run.store, hash);
+	printf("%s %zu patches %llu rows\n", hash, patch_store_count(run.store), (unsigned long long)run.rows);
 	return 0;
 }

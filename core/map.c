@@ -1,8 +1,9 @@
 /* The way of a row through the map: field -> dirty patches -> windows -> surfaces -> reduced patches.
  *
- * A patch is a pure function of the voxels (law L2), so nothing here remembers a mesh. What is remembered are times,
- * which no hash contains: of rows that the field still holds back, to know that of the newest one applied, and when
- * a patch was dirty for the first time. map_mesh_patch only reads, so that several threads may call it. */
+ * A patch is a pure function of the voxels (law L2), and what is remembered changes none: times, which
+ * no hash contains, of rows that the field still holds back and of when a patch was dirty for the first time; and the last
+ * meshes, each with a digest of what it was made of. map_mesh_patch writes to the slot of its own key only, so that
+ * several threads may call it for different patches. */
 #include "core/map.h"
 
 #include <assert.h>
@@ -10,6 +11,7 @@
 #include <string.h>
 
 #include "core/arena.h"
+#include "core/memo.h"
 
 #define WAITING_MAX 64 /* rows held back whose times are kept; beyond, the oldest time is forgotten */
 
@@ -29,6 +31,7 @@ struct map {
 	uint32_t waiting_first, waiting_count;
 	struct birth *birth; /* open addressing; births_cap is a power of two, at most half full */
 	size_t births, births_cap;
+	struct memo *memo;
 };
 
 struct mesher {
@@ -48,10 +51,11 @@ struct map *map_create(const struct map_params *params)
 	map->params = *params;
 	map->births_cap = 256;
 	map->birth = calloc(map->births_cap, sizeof *map->birth);
+	map->memo = calloc(1, sizeof *map->memo);
 	map->grid = grid_create(params->memory);
 	struct field_params field = {.cell_m = params->cell_m, .lookahead = params->lookahead};
 	map->field = map->grid ? field_create(&field, map->grid) : NULL;
-	if (!map->birth || !map->field) {
+	if (!map->birth || !map->memo || !map->field) {
 		map_destroy(map);
 		return NULL;
 	}
@@ -67,6 +71,9 @@ void map_destroy(struct map *map)
 	if (map->grid)
 		grid_destroy(map->grid);
 	free(map->birth);
+	if (map->memo)
+		memo_finish(map->memo);
+	free(map->memo);
 	free(map);
 }
 
@@ -164,6 +171,7 @@ size_t map_take_dirty(struct map *map, const struct patch_key **ret_keys)
 	size_t n = grid_take_dirty(map->grid, ret_keys);
 	for (size_t i = 0; i < n; i++)
 		note_birth(map, (*ret_keys)[i]);
+	memo_expect(map->memo, *ret_keys, n);
 	return n;
 }
 
@@ -204,15 +212,32 @@ int map_extract(const struct map *map, struct mesher *mesher, struct patch_key k
 	return r;
 }
 
+/* The patch of the mesher's surface, without version and times: remembered, or made and then remembered. */
+static struct patch *reduce_or_recall(const struct map *map, struct mesher *mesher)
+{
+	const struct reduce_params params = {.tolerance = map->params.tolerance};
+	struct patch_key key = mesher->window.key;
+	struct border border;
+	struct surface surface;
+	if (reduce_border(&mesher->window, &mesher->raw, &params, &mesher->arena, &border))
+		return NULL;
+	struct digest digest = memo_digest(&mesher->raw, &border);
+	const struct patch *before = memo_find(map->memo, key, digest);
+	if (before)
+		return patch_copy(before);
+	if (reduce_within(&border, &mesher->raw, &params, &mesher->arena, &mesher->stats, &surface))
+		return NULL;
+	struct patch *patch = patch_create(key, &surface);
+	if (patch)
+		memo_keep(map->memo, digest, patch);
+	return patch;
+}
+
 struct patch *map_reduce(const struct map *map, struct mesher *mesher)
 {
 	assert(map && mesher);
-	struct surface surface = mesher->raw;
-	const struct reduce_params params = {.tolerance = map->params.tolerance};
-	if (map->params.reduce &&
-	    reduce_surface(&mesher->window, &mesher->raw, &params, &mesher->arena, &mesher->stats, &surface))
-		return NULL;
-	struct patch *patch = patch_create(mesher->window.key, &surface);
+	struct patch *patch = map->params.reduce && mesher->raw.nt ? reduce_or_recall(map, mesher)
+	                                                           : patch_create(mesher->window.key, &mesher->raw);
 	if (!patch)
 		return NULL;
 	const struct birth *birth = find_birth(map->birth, map->births_cap, patch->key);

@@ -56,7 +56,7 @@ static void rotate_triangle(const uint32_t from[3], uint32_t to[3])
 		to[c] = from[(first + c) % 3];
 }
 
-static size_t patch_bytes(const struct patch *patch)
+size_t patch_bytes(const struct patch *patch)
 {
 	return sizeof *patch + patch->nt * sizeof *patch->triangle + patch->nruns * sizeof *patch->run +
 	       patch->nv * sizeof *patch->vertex;
@@ -105,6 +105,14 @@ struct patch *patch_create(struct patch_key key, const struct surface *surface)
 			memcpy(patch->vertex, surface->vertex, nv * sizeof *patch->vertex);
 	}
 	free(order);
+	return patch;
+}
+
+struct patch *patch_copy(const struct patch *from)
+{
+	struct patch *patch = patch_allocate(from->key, from->nv, from->nt, from->nruns);
+	if (patch) /* triangles, runs and vertices lie in a row */
+		memcpy(patch + 1, from + 1, patch_bytes(from) - sizeof *from);
 	return patch;
 }
 

@@ -32,6 +32,9 @@ struct patch {
 struct patch *patch_create(struct patch_key, const struct surface *);
 /* Zeroed, for a reader that fills it. References: 1. NULL when memory is out. */
 struct patch *patch_allocate(struct patch_key, uint32_t nv, uint32_t nt, uint32_t nruns);
+/* Geometry and runs of another one; version and times zero. References: 1. NULL when memory is out. */
+struct patch *patch_copy(const struct patch *);
+size_t patch_bytes(const struct patch *);
 struct patch *patch_ref(struct patch *);
 void patch_unref(struct patch *);
 bool patch_equal(const struct patch *a, const struct patch *b); /* geometry and runs; not version and times */

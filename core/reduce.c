@@ -40,20 +40,18 @@ static int gather(const struct simplify *s, struct arena *arena, struct surface 
 	return 0;
 }
 
-int reduce_surface(const struct window *window, const struct surface *raw, const struct reduce_params *params,
-                   struct arena *arena, struct reduce_stats *stats, struct surface *ret)
+int reduce_border(const struct window *window, const struct surface *raw, const struct reduce_params *params,
+                  struct arena *arena, struct border *ret)
 {
-	assert(window && raw && params && arena && stats && ret);
 	assert(params->tolerance >= 0 && params->tolerance <= 1);
-	if (!raw->nt) {
-		*ret = (struct surface){0};
-		return 0;
-	}
-	struct border border;
+	return border_find(window, raw, (int64_t)(params->tolerance * LATTICE), arena, ret);
+}
+
+int reduce_within(const struct border *border, const struct surface *raw, const struct reduce_params *params,
+                  struct arena *arena, struct reduce_stats *stats, struct surface *ret)
+{
 	struct simplify s;
-	int r = border_find(window, raw, (int64_t)(params->tolerance * LATTICE), arena, &border);
-	if (!r)
-		r = simplify_init(&s, raw, &border, params->tolerance, arena);
+	int r = simplify_init(&s, raw, border, params->tolerance, arena);
 	if (r)
 		return r;
 	border_fit(&s.mesh, &s.border, stats);
@@ -64,4 +62,17 @@ int reduce_surface(const struct window *window, const struct surface *raw, const
 	if (!r)
 		r = simplify_collapse(&s, arena);
 	return r ? r : gather(&s, arena, ret);
+}
+
+int reduce_surface(const struct window *window, const struct surface *raw, const struct reduce_params *params,
+                   struct arena *arena, struct reduce_stats *stats, struct surface *ret)
+{
+	assert(window && raw && params && arena && stats && ret);
+	if (!raw->nt) {
+		*ret = (struct surface){0};
+		return 0;
+	}
+	struct border border;
+	int r = reduce_border(window, raw, params, arena, &border);
+	return r ? r : reduce_within(&border, raw, params, arena, stats, ret);
 }

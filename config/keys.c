@@ -33,8 +33,8 @@ const struct key key_table[] = {
 	{GROUP_MAP, "reduce", KEY_SWITCH, .preset = "on", CONFIG(map.reduce), .help = "Replace flat parts by few large triangles."},
 	{GROUP_MAP, "tolerance", KEY_REAL, .preset = "0.25", .min = 0.01, .max = 1, CONFIG(map.tolerance), .help = "How far the reduced surface may be from the unreduced one, in cells."},
 	{GROUP_MAP, "snap", KEY_REAL, .preset = "0.15", .min = 0, .max = 0.5, CONFIG(map.snap), .help = "How far a vertex may be moved onto a plane, in cells. Used with planes only."},
-	{GROUP_MAP, "lookahead", KEY_INTEGER, .preset = "2", .min = 0, .max = 8, CONFIG(map.lookahead), .help = "Rows a row waits for, so that its normals know both sides. Counts as latency."},
-	{GROUP_MAP, "memory", KEY_INTEGER, .preset = "256M", .dimension = DIMENSION_BYTES, .min = 16 * MEGA, .max = 65536 * MEGA, CONFIG(map.memory), .help = "Everything the map may own. At the limit new blocks are refused, counted and reported."},
+	{GROUP_MAP, "lookahead", KEY_INTEGER, .preset = "2", .min = 0, .max = 2, CONFIG(map.lookahead), .help = "Rows a row waits for, so that its normals know both sides. Counts as latency."},
+	{GROUP_MAP, "memory", KEY_INTEGER, .preset = "256M", .dimension = DIMENSION_BYTES, .min = 16 * MEGA, .max = 65536 * MEGA, CONFIG(map.memory), .help = "What the voxels of the map may take. At the limit new blocks are refused, counted and reported; meshes and what is on its way to clients come on top."},
 	{GROUP_MAP, "hold", KEY_DURATION, .preset = "30ms", .dimension = DIMENSION_TIME, .min = 0, .max = 1, CONFIG(map.hold_ns), .help = "How long a profile waits for newer tilt and pose samples."},
 	{GROUP_MAP, "window", KEY_TEXT, .preset = "none", .later = "a map that forgets what lies far behind", .help = "Keep only what is near the robot."},
 

@@ -213,6 +213,8 @@ static int choice_index(const char *choices, const char *text)
 {
 	const size_t len = strlen(text);
 	int i = 0;
+	if (strchr(text, '|'))
+		return -1;
 	for (const char *c = choices; c; c = strchr(c, '|') ? strchr(c, '|') + 1 : NULL, i++)
 		if (strncmp(c, text, len) == 0 && (c[len] == '|' || c[len] == '\0'))
 			return i;

@@ -402,7 +402,8 @@ void modbus_dialogue_step(struct dialogue *d, int64_t t_ns, struct dialogue_step
 			snprintf(ret->error, sizeof ret->error, "%s", d->error);
 		return;
 	}
-	ret->state = d->phase == WRITING ? DIALOGUE_CONFIGURING : DIALOGUE_STREAMING;
+	/* Nothing streams before the first answer: a servo that is away would else be lost and back at every try. */
+	ret->state = d->phase == WRITING || !d->angle_known ? DIALOGUE_CONFIGURING : DIALOGUE_STREAMING;
 	ret->deadline_ns = deadline(d, t_ns);
 }
 

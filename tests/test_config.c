@@ -170,6 +170,9 @@ static void a_value_out_of_range_names_the_range(void **state)
 	assert_refused("map:\n memory: 1M", "f.yaml:2: map.memory: '1M'", "16M .. 64G");
 	assert_refused("map: {hold: 2s}", "f.yaml:1: map.hold: '2s'", "0 .. 1s");
 	assert_refused("map: {field: distnce}", "f.yaml:1: map.field", "one of distance, hoppe, direct");
+	assert_refused("map: {lookahead: 3}", "f.yaml:1: map.lookahead: '3'", "0 .. 2"); /* the field knows no more */
+	assert_refused("map: {reduce: 'off|on'}", "f.yaml:1: map.reduce", "on");
+	assert_refused("devices:\n - {name: l, driver: 'lms2xx|modbus'}", "f.yaml:2: devices", "one of");
 	assert_refused("map: {lookahead: 1.5}", "f.yaml:1: map.lookahead", "not a whole number");
 	assert_refused(with_devices("sweep: {device: servo, from: -65}\n"), "f.yaml:4: sweep.from: '-65'",
 	               "-180deg .. 180deg (a number without a unit is in radians; write `deg`");

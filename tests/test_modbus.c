@@ -438,6 +438,25 @@ static void count_turns(void *ctx, double angle)
 	turns->high = fmax(turns->high, angle);
 }
 
+static void a_servo_that_never_answered_does_not_stream(void **state)
+{
+	struct config config = servo_config();
+	struct dialogue *d = driver_modbus.dialogue_create(&config, 0);
+	struct virtual_servo servo = {.angle = 0};
+	struct dialogue_step step;
+	int64_t t_ns = 5000000000;
+
+	(void)state;
+	for (int life = 0; life < 2; life++) { /* a link that is lost and opened anew begins again */
+		driver_modbus.dialogue_reset(d, t_ns);
+		driver_modbus.dialogue_step(d, t_ns, &step);
+		assert_int_equal(step.state, DIALOGUE_CONFIGURING);
+		virtual_run(d, &servo, &config, &t_ns, 1.0, &step, NULL, NULL);
+		assert_int_equal(step.state, DIALOGUE_STREAMING);
+	}
+	driver_modbus.dialogue_destroy(d);
+}
+
 static void a_triangle_sweeps_between_its_ends_for_hours(void **state)
 {
 	struct config config = servo_config();
@@ -947,6 +966,7 @@ int main(void)
 	    cmocka_unit_test(a_slow_round_trip_is_refused_and_a_slower_bus_is_followed),
 	    cmocka_unit_test(a_slow_answer_of_a_servo_that_stands_is_taken),
 	    cmocka_unit_test(foreign_refused_and_absurd_records_are_counted_not_decoded),
+	    cmocka_unit_test(a_servo_that_never_answered_does_not_stream),
 	    cmocka_unit_test(a_triangle_sweeps_between_its_ends_for_hours),
 	    cmocka_unit_test(a_sinus_slows_down_towards_its_ends),
 	    cmocka_unit_test(steps_are_settled_and_stay_within_the_ends),

@@ -1,0 +1,110 @@
+#!/bin/sh
+# Law L9: devices that vanish under a running daemon cost what they would have seen and nothing else: they stream again by
+# themselves when they are back, the map goes on from where it stood, and the log has a line for each change, not for each try.
+cd "$(dirname "$0")/.." || exit 2
+build=$PWD/${FACET_BUILD:-build}
+scratch=$(mktemp -d)
+simulator='' daemon=''
+unset FACETD XDG_RUNTIME_DIR FACETD_CONFIG
+cleanup() {
+    for pid in $daemon $simulator; do kill -KILL "$pid" 2>/dev/null; done
+    wait 2>/dev/null
+    rm -rf "$scratch"
+}
+trap cleanup EXIT
+trap 'exit 1' INT TERM
+failed=0
+
+fail() {
+    echo "FAILED: $*"
+    failed=1
+}
+
+give_up() {
+    fail "$@"
+    cat "$scratch"/*.log
+    exit 1
+}
+
+until_true() { # COMMAND...: tried five times a second for a minute
+    end=$(($(date +%s) + 60))
+    while ! "$@"; do
+        [ "$(date +%s)" -lt $end ] || return 1
+        sleep 0.2
+    done
+}
+
+# shellcheck disable=SC2120
+start_devices() { # ARGUMENTS...
+    "$build/facet" simulate hall --dir "$scratch/d" "$@" >>"$scratch/simulator.log" 2>&1 &
+    simulator=$!
+    until_true [ -e "$scratch/d/servo" ] || give_up "the simulator does not come up"
+}
+
+status() { # EXPRESSION over the status s and its devices d: its value
+    timeout 20 "$build/facet" watch --once --json "unix:$scratch/d/facetd.sock" 2>/dev/null | python3 -c '
+import json, sys
+line = sys.stdin.readline()
+if not line: sys.exit(1)
+s = json.loads(line)
+d = {device["name"]: device for device in s["devices"]}
+value = eval(sys.argv[1])
+print(value)
+sys.exit(value is False)' "$1"
+}
+
+holds() {
+    status "$1" >/dev/null
+}
+
+step_of() {
+    status 's["step"]'
+}
+
+lines() { # PATTERN: how often the daemon's log says it
+    grep -c "$1" "$scratch/daemon.log"
+}
+
+ALL='all(device["state"] == "streaming" for device in d.values())'
+start_devices
+"$build/facetd" --config "$scratch/d/facetd.yaml" 2>"$scratch/daemon.log" &
+daemon=$!
+until_true holds "$ALL and s['step'] >= 20" || give_up "the devices do not stream"
+
+# Pulled out: the nodes go, as udev takes them, and nobody may meet a stranger's terminal of the same number.
+rm -f "$scratch/d/laser" "$scratch/d/servo"
+kill -KILL $simulator
+wait $simulator 2>/dev/null
+simulator=''
+# Ten tries of both, so that a line for each would be seen.
+until_true holds 'all(d[name]["state"] != "streaming" and d[name]["losses"] >= 5 for name in ("laser", "servo"))' ||
+    give_up "the devices are not lost"
+before=$(step_of)
+map=$(status 's["map"], s["generation"]')
+tries=$(status 'd["laser"]["losses"] + d["servo"]["losses"]')
+kill -0 $daemon || give_up "the daemon ended with its devices"
+
+# Plugged in again.
+start_devices
+begin=$(date +%s)
+[ "$(step_of)" -ge "$before" ] || fail "the map fell back from step $before"
+until_true holds "$ALL" || give_up "the devices do not come back"
+until_true holds "$ALL and s['step'] >= $before + 20" || give_up "the map does not grow again after step $before: $(step_of)"
+after=$(step_of)
+[ "$(status 's["map"], s["generation"]')" = "$map" ] || fail "it is another map now"
+echo "note: $tries tries while the devices were away, $(wc -l <"$scratch/daemon.log") lines of log, step $before to $after $(($(date +%s) - begin)) s after their return"
+
+[ "$(wc -l <"$scratch/daemon.log")" -lt 20 ] || fail "the log is flooded"
+for name in laser servo; do
+    # A loaded machine may lose a device once more; then it says so, and that it came back.
+    lost=$(lines "$name: lost") streaming=$(lines "$name: streaming") refused=$(lines "$name: not ready")
+    [ "$lost" -ge 1 ] && [ "$streaming" -eq $((lost + 1)) ] || fail "$name: lost $lost times, streaming $streaming times"
+    [ "$refused" -ge 1 ] || fail "$name: nothing says why it does not come back"
+    [ "$(grep "$name: not ready" "$scratch/daemon.log" | sed 's/.*not ready/not ready/; s/ (.*//' | sort | uniq -d | wc -l)" -le $((lost - 1)) ] ||
+        fail "$name: the same reason is told again and again"
+done
+kill -TERM $daemon
+wait $daemon || fail "the daemon did not end well"
+daemon=''
+[ $failed -eq 0 ] || cat "$scratch/daemon.log"
+exit $failed

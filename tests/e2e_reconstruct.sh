@@ -124,6 +124,8 @@ mkfifo pipe.xyz
     refused 1 '^facet: empty.xyz: no points' $bad empty.xyz
     refused 1 '^facet: pipe.xyz: ' $bad pipe.xyz
     refused 1 '^facet: scan000.3d/inside.3d: ' $bad scan000.3d/inside.3d
+    echo '0 1 2 3 0 0 0 0' >none.tum
+    refused 1 'none.tum:1: qx qy qz qw have the length 0' $bad --poses none.tum scan000.3d
     refused 1 'list.tum: has 1 poses for 2 inputs' $bad --poses list.tum scan000.3d scan000.3d
     refused 1 '^facet: nowhere/bad.ply: ' reconstruct -o nowhere/bad.ply scan000.3d
     refused 1 '^facet: folder.ply: ' reconstruct -o folder.ply scan000.3d

@@ -51,6 +51,7 @@ THREADED := test_worker test_server test_replay test_modbus test_sim_servo test_
 FUZZ := $(patsubst tests/%.c,%,$(wildcard tests/fuzz_*.c))
 LIBRARIES := $(B)/libtools.a $(B)/libdaemon.a $(B)/libdrivers.a $(B)/libconfig.a $(B)/libcore.a
 
+.SECONDARY:
 .PHONY: all tests check demo bench soak fuzz lint format deps install clean help run-check run-demo needed
 all: needed $(B)/facetd $(B)/facet
 tests: needed $(addprefix $(B)/tests/,$(TESTS) $(PROGRAMS))

@@ -72,7 +72,7 @@ static char *read_file(const char *path, size_t *ret_len)
 	if (!file || !text || ferror(file)) {
 		fprintf(
 		    stderr,
-		    "facetd: %s: cannot be read (%s); give a configuration with --config, the manual is facetd.yaml\n",
+		    "facetd: %s: cannot be read (%s); give a configuration with --config; facetd --manual prints one with comments\n",
 		    path, strerror(errno ? errno : EIO));
 		free(text);
 		text = NULL;

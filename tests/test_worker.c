@@ -308,7 +308,9 @@ static void under_load_many_rows_share_a_mesh_but_none_waits_for_ever(void **sta
 
 	(void)state;
 	gate_set(true);
-	for (uint64_t i = 0; i < WORKER_ROWS_MAX; i++)
+	assert_true(give_row(worker, 0));
+	gate_wait_reached(); /* row 0 is in the worker's hands: what comes now waits behind it */
+	for (uint64_t i = 1; i < WORKER_ROWS_MAX; i++)
 		assert_true(give_row(worker, i));
 	gate_set(false);
 	while (view.step < WORKER_ROWS_MAX) {
@@ -318,8 +320,8 @@ static void under_load_many_rows_share_a_mesh_but_none_waits_for_ever(void **sta
 		assert_in_range(view.step - before, 1, WORKER_MESH_ROWS);
 		results++;
 	}
-	/* All rows waited already: each set but the last has the full number. */
-	assert_int_equal(results, WORKER_ROWS_MAX / WORKER_MESH_ROWS);
+	/* Row 0 found nobody behind it and may be a set of its own; all others waited and fill their sets. */
+	assert_in_range(results, WORKER_ROWS_MAX / WORKER_MESH_ROWS, WORKER_ROWS_MAX / WORKER_MESH_ROWS + 1);
 	worker_destroy(worker);
 }
 

@@ -111,6 +111,8 @@ static int write_map(const struct native_mirror *mirror, const struct job *job)
 	if (is_json(job->output)) {
 		status =
 		    output_write(job->output, "[]\n", 3, &error); /* planes of the whole map come with its registry */
+		if (!status)
+			printf("%s: no planes: those of the whole map come in a later version\n", job->output);
 	} else {
 		if (model_weld(native_mirror_patches(mirror), native_mirror_hello(mirror)->cell_m, &model)) {
 			fprintf(stderr, "facet: %s: not enough memory for this map\n", job->output);

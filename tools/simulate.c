@@ -398,7 +398,9 @@ static void stop_loop(struct simulation *s)
 static void say_where(const struct simulation *s, const struct options *o)
 {
 	printf("devices in %s, configuration %s/facetd.yaml\n", s->dir, s->dir);
-	printf("address unix:%s/facetd.sock%s%s\n", s->dir, o->tcp ? " tcp:" : "", o->tcp ? o->tcp : "");
+	printf("address unix:%s/facetd.sock\n", s->dir);
+	if (o->tcp)
+		printf("address tcp:%s\n", o->tcp);
 }
 
 static int simulate(struct simulation *s, const struct options *o)

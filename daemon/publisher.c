@@ -573,9 +573,16 @@ int64_t publisher_deadline(const struct publisher_client *client)
 	return client->bytes_per_s ? client->next_ns : INT64_MAX;
 }
 
+size_t publisher_json_room(const struct publisher_client *client)
+{
+	size_t used = client->json.len + NATIVE_HEAD + 1;
+
+	return used > PUBLISHER_JSON_MAX || client->dismissed ? 0 : PUBLISHER_JSON_MAX - used;
+}
+
 bool publisher_json(struct publisher_client *client, const char *text, size_t len)
 {
-	if (client->json.len + len + NATIVE_HEAD + 1 > PUBLISHER_JSON_MAX || client->dismissed) {
+	if (client->dismissed || len > publisher_json_room(client)) {
 		client->stats.skipped_json++;
 		return false;
 	}

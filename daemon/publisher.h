@@ -52,6 +52,7 @@ int64_t publisher_deadline(const struct publisher_client *);
 
 /* A JSON message between others. False: dropped, too much waits already. */
 bool publisher_json(struct publisher_client *, const char *text, size_t len);
+size_t publisher_json_room(const struct publisher_client *); /* the longest text it takes now */
 void publisher_ping(struct publisher_client *);
 
 /* True once the client is to be closed and everything it is still owed, the reason included, has been written. */

@@ -4,8 +4,9 @@
  *                                                 └─ else ────► native: a publisher_client
  *
  * Sockets are polled, not handed to uv_write: what a client is sent is decided by the publisher at the moment there is
- * room for it, and nothing queues here. Reads and writes are bounded a turn, so that one client's appetite is not
- * another's latency. A client that is to be closed keeps its socket for a second at most, to take the reason.
+ * room for it, and nothing queues here. Reads, messages and writes are bounded a turn, so that one client's appetite is
+ * not another's latency; what is read and not yet heard waits for the next turn, and nothing more is read until then.
+ * A client that is to be closed keeps its socket for a second at most, to take the reason.
  *
  * Questions of a client that does not read its answers wait in its socket: its own sends then block, nobody else's. */
 #include "daemon/server.h"
@@ -24,10 +25,12 @@
 #include "daemon/listener.h"
 
 #define READ_BYTES   16384
-#define ACCEPTS_MAX  16  /* in one turn */
-#define DRAINS_MAX   16  /* reads that are thrown away at the end */
-#define TICK_MS      100 /* deadlines and limited rates */
-#define TICKS_STATUS 10  /* a status a second, to those who watch */
+#define ACCEPTS_MAX  16          /* in one turn */
+#define MESSAGES_MAX 16          /* of one client, heard in one turn */
+#define DRAINS_MAX   16          /* reads that are thrown away at the end */
+#define TICK_MS      100         /* deadlines and limited rates */
+#define TICKS_STATUS 10          /* a status a second, to those who watch */
+#define STATUS_NS    100000000ll /* a status is so old at most: building one walks the whole daemon and reads /proc */
 
 enum kind { KIND_UNKNOWN, KIND_NATIVE, KIND_LINES };
 
@@ -39,6 +42,7 @@ struct connection {
 	enum kind kind;
 	uint64_t id;
 	bool local, excess, watches, closing;
+	bool more;             /* `in` holds messages that this turn had no room for */
 	bool ended;            /* the client sends no more */
 	bool dismissed;        /* it is told why it is closed, and not heard any more */
 	int64_t deadline_ns;   /* closed then, whatever is left; INT64_MAX: stays */
@@ -64,7 +68,10 @@ struct server {
 	struct door door[CONFIG_LISTEN_MAX];
 	int doors;
 	uv_timer_t timer;
+	uv_idle_t hearing; /* turns while somebody has more to say */
 	unsigned ticks;
+	struct buffer status; /* the last one built */
+	int64_t status_ns;
 	struct connection *connections;
 	size_t count; /* of connections, those that are told to go included */
 	uint64_t next_id;
@@ -133,6 +140,7 @@ static void wrote(struct connection *c, size_t n, int64_t t_ns)
 }
 
 static void on_connection(uv_poll_t *poll, int status, int events);
+static void on_hearing(uv_idle_t *idle);
 
 static void set_events(struct connection *c, int events)
 {
@@ -155,6 +163,12 @@ static bool is_done(const struct connection *c)
 	return c->out.error || (c->out.len == 0 && (c->dismissed || (c->ended && !unheard)));
 }
 
+/* Its next message may be heard, if there is one: there is room for the answer. */
+static bool can_hear(const struct connection *c)
+{
+	return c->kind != KIND_UNKNOWN && !c->closing && !c->dismissed && c->out.len <= SERVER_LINES_MAX;
+}
+
 /* Writes what there is until the socket is full or the turn is over, and polls for what is then to be waited for. */
 static void pump(struct connection *c)
 {
@@ -163,6 +177,8 @@ static void pump(struct connection *c)
 	size_t n, total = 0;
 	bool full = false;
 
+	if (c->closing)
+		return;
 	while (!full && total < SERVER_TURN_BYTES && (n = next_bytes(c, t_ns, &bytes)) > 0) {
 		ssize_t sent = send(c->fd, bytes, n, MSG_NOSIGNAL | MSG_DONTWAIT);
 
@@ -182,7 +198,9 @@ static void pump(struct connection *c)
 	}
 	if (c->client && publisher_reason(c->client) && c->deadline_ns == INT64_MAX)
 		c->deadline_ns = t_ns + SERVER_LINGER_NS;
-	set_events(c, (c->ended || c->dismissed || c->out.len > SERVER_LINES_MAX ? 0 : UV_READABLE) |
+	if (c->more && can_hear(c))
+		uv_idle_start(&c->server->hearing, on_hearing);
+	set_events(c, (c->ended || c->dismissed || c->more || c->out.len > SERVER_LINES_MAX ? 0 : UV_READABLE) |
 	                  (full || total >= SERVER_TURN_BYTES ? UV_WRITABLE : 0));
 }
 
@@ -225,6 +243,29 @@ static void dismiss(struct connection *c, const char *reason)
 	c->deadline_ns = c->server->host.now(c->server->host.ctx) + SERVER_LINGER_NS;
 }
 
+static const struct buffer *status_text(struct server *s)
+{
+	int64_t t_ns = s->host.now(s->host.ctx);
+
+	if (s->status.len == 0 || s->status.error || t_ns - s->status_ns >= STATUS_NS || t_ns < s->status_ns) {
+		buffer_finish(&s->status);
+		s->host.status(s->host.ctx, &s->status);
+		s->status_ns = t_ns;
+	}
+	return &s->status;
+}
+
+static void say_status(struct connection *c)
+{
+	struct server *s = c->server;
+
+	/* One that has no room for the last status has none for a new one: dropped and counted, not built. */
+	if (c->client && publisher_json_room(c->client) < s->status.len)
+		say(c, &s->status);
+	else
+		say(c, status_text(s));
+}
+
 static void do_command(struct connection *c, const struct control_command *command)
 {
 	struct server *s = c->server;
@@ -239,12 +280,15 @@ static void do_command(struct connection *c, const struct control_command *comma
 		say_error(c, error);
 		return;
 	}
+	if (control_changes(command->word))
+		s->status.len = 0; /* who changes something and asks sees the change */
 	if (command->word == CONTROL_WATCH)
 		c->watches = command->enable;
-	if (command->word == CONTROL_STATUS)
-		s->host.status(s->host.ctx, &text);
-	else
-		control_put_answer(&text, command);
+	if (command->word == CONTROL_STATUS) {
+		say_status(c);
+		return;
+	}
+	control_put_answer(&text, command);
 	say(c, &text);
 	buffer_finish(&text);
 }
@@ -372,11 +416,12 @@ static void hear(struct connection *c)
 {
 	size_t at = 0, n = 1;
 
+	c->more = false;
 	if (c->in.len == 0)
 		return;
 	if (c->kind == KIND_UNKNOWN)
 		recognise(c);
-	while (c->kind != KIND_UNKNOWN && !c->dismissed && at < c->in.len && n > 0 && c->out.len <= SERVER_LINES_MAX) {
+	for (int heard = 0; heard < MESSAGES_MAX && can_hear(c) && at < c->in.len && n > 0; heard++) {
 		const uint8_t *data = c->in.data + at;
 
 		n = c->kind == KIND_LINES ? hear_line(c, data, c->in.len - at) : hear_frame(c, data, c->in.len - at);
@@ -384,6 +429,22 @@ static void hear(struct connection *c)
 	}
 	c->in.len -= at;
 	memmove(c->in.data, c->in.data + at, c->in.len);
+	c->more = c->kind != KIND_UNKNOWN && n > 0 && c->in.len > 0;
+}
+
+static void on_hearing(uv_idle_t *idle)
+{
+	struct server *s = idle->data;
+	struct connection *next;
+
+	uv_idle_stop(idle); /* pump starts it again for one that has still more */
+	for (struct connection *c = s->connections; c; c = next) {
+		next = c->next; /* stays valid for this turn, even if a command closes it */
+		if (!c->more || !can_hear(c))
+			continue;
+		hear(c);
+		pump(c);
+	}
 }
 
 /* False: the connection is gone. */
@@ -415,7 +476,6 @@ static bool receive(struct connection *c)
 static void on_connection(uv_poll_t *poll, int status, int events)
 {
 	struct connection *c = poll->data;
-	size_t waiting;
 
 	if (status < 0) {
 		close_connection(c);
@@ -423,11 +483,9 @@ static void on_connection(uv_poll_t *poll, int status, int events)
 	}
 	if ((events & UV_READABLE) && !c->ended && !receive(c))
 		return;
-	do { /* questions that waited for their answers to be read come now */
-		waiting = c->in.len;
+	if (!c->more) /* else on_hearing goes on, once there is room for answers */
 		hear(c);
-		pump(c);
-	} while (!c->closing && c->in.len > 0 && c->in.len < waiting);
+	pump(c);
 }
 
 /* Accepting */
@@ -513,16 +571,13 @@ static void tell_watchers(struct server *s, const struct buffer *text)
 
 static void tell_status(struct server *s)
 {
-	struct buffer text = {0};
 	bool anybody = false;
 
 	for (struct connection *c = s->connections; c; c = c->next)
 		anybody |= c->watches;
 	if (!anybody)
 		return;
-	s->host.status(s->host.ctx, &text);
-	tell_watchers(s, &text);
-	buffer_finish(&text);
+	tell_watchers(s, status_text(s));
 }
 
 static void on_timer(uv_timer_t *timer)
@@ -629,6 +684,8 @@ struct server *server_create(uv_loop_t *loop, const struct config *config, struc
 	s->host = *host;
 	uv_timer_init(loop, &s->timer);
 	s->timer.data = s;
+	uv_idle_init(loop, &s->hearing);
+	s->hearing.data = s;
 	for (int i = 0; i < config->listen.natives; i++)
 		if (!open_door(s, config->listen.native[i], error)) {
 			server_stop(s);
@@ -653,6 +710,7 @@ void server_stop(struct server *s)
 		uv_close((uv_handle_t *)&s->door[i].poll, NULL);
 	}
 	uv_close((uv_handle_t *)&s->timer, NULL);
+	uv_close((uv_handle_t *)&s->hearing, NULL);
 }
 
 void server_destroy(struct server *s)
@@ -662,5 +720,6 @@ void server_destroy(struct server *s)
 	assert(s->stopped && !s->connections);
 	for (int i = 0; i < s->doors; i++)
 		listener_close(&s->door[i].listener);
+	buffer_finish(&s->status);
 	free(s);
 }

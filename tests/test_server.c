@@ -29,7 +29,7 @@ static struct config config;
 static struct publisher *publisher;
 static struct server *server;
 static int64_t virtual_ns;
-static int pauses, resumes, resets;
+static int pauses, resumes, resets, statuses;
 static uint64_t step;
 
 /* The host */
@@ -43,6 +43,7 @@ static int64_t host_now(void *ctx)
 static void host_status(void *ctx, struct buffer *ret)
 {
 	(void)ctx;
+	statuses++;
 	buffer_printf(ret, "{\"class\":\"STATUS\",\"filler\":\"%0900d\"}", 7);
 }
 
@@ -81,7 +82,7 @@ static int set_up(void **state)
 	config.listen.clients = 4;
 	uv_loop_init(&loop);
 	virtual_ns = SECOND;
-	pauses = resumes = resets = 0;
+	pauses = resumes = resets = statuses = 0;
 	step = 0;
 	publisher = publisher_create(&params);
 	server = server_create(&loop, &config, publisher, &host, error);
@@ -578,6 +579,96 @@ static void a_client_that_asks_and_does_not_read_blocks_only_itself(void **state
 	peer_close(&other);
 }
 
+/* `n` times one text, as lines or as frames, in one piece. */
+static void peer_flood(struct peer *peer, bool lines, const char *text, int n)
+{
+	struct buffer b = {0};
+
+	for (int i = 0; i < n; i++)
+		if (lines)
+			buffer_printf(&b, "%s\n", text);
+		else
+			native_put_json(&b, text, strlen(text));
+	peer_say(peer, b.data, b.len);
+	buffer_finish(&b);
+}
+
+static void of_a_thousand_messages_a_turn_hears_a_few_and_later_turns_the_rest(void **state)
+{
+	(void)state;
+	for (int lines = 0; lines < 2; lines++) {
+		struct peer peer;
+		int turns = 0, most = 0;
+
+		pauses = 0;
+		peer_unix(&peer);
+		if (lines)
+			peer_line(&peer, "?STATUS\n");
+		else
+			peer_want(&peer);
+		turn(3);
+		peer_flood(&peer, lines, "?PAUSE", 1000);
+		for (; pauses < 1000 && turns < 1000; turns++) {
+			int before = pauses;
+
+			turn(1);
+			most = pauses - before > most ? pauses - before : most;
+			peer_read(&peer);
+		}
+		assert_int_equal(pauses, 1000);
+		assert_in_range(most, 1, 16);
+		peer_close(&peer);
+		turn(3);
+	}
+}
+
+static void a_status_is_built_ten_times_a_second_at_most(void **state)
+{
+	struct peer lines, native;
+
+	(void)state;
+	peer_unix(&lines);
+	peer_unix(&native);
+	peer_want(&native);
+	peer_flood(&lines, true, "?STATUS", 500);
+	peer_flood(&native, false, "?STATUS", 500);
+	lines.want_bytes = 500 * 929;
+	assert_true(turn_until(has_bytes, &lines));
+	assert_true(turn_until(has_reason, &native));
+	assert_int_equal(statuses, 1);
+	virtual_ns += SECOND / 10;
+	lines.want_bytes += 929;
+	peer_line(&lines, "?STATUS\n");
+	assert_true(turn_until(has_bytes, &lines));
+	assert_int_equal(statuses, 2);
+	peer_line(&lines, "?PAUSE\n?STATUS\n"); /* the change is seen at once */
+	lines.want_bytes += 929;
+	assert_true(turn_until(has_bytes, &lines));
+	assert_int_equal(statuses, 3);
+	peer_close(&lines);
+	peer_close(&native);
+}
+
+static void no_status_is_built_for_a_client_that_has_no_room_for_it(void **state)
+{
+	struct peer deaf;
+	int built = 0;
+
+	(void)state;
+	peer_unix(&deaf);
+	peer_want(&deaf);
+	for (int i = 0; i < 600; i++) {
+		peer_flood(&deaf, false, "?STATUS", 1);
+		virtual_ns += SECOND / 10;
+		turn(1);
+		if (i == 400)
+			built = statuses;
+	}
+	assert_in_range(built, 70, 350);
+	assert_int_equal(statuses, built);
+	peer_close(&deaf);
+}
+
 static void a_client_that_ends_its_half_still_gets_its_answers(void **state)
 {
 	struct peer peer;
@@ -742,6 +833,9 @@ int main(void)
 	    CLAIM(a_frame_only_a_server_sends_ends_the_connection),
 	    CLAIM(a_line_without_end_is_refused),
 	    CLAIM(a_client_that_asks_and_does_not_read_blocks_only_itself),
+	    CLAIM(of_a_thousand_messages_a_turn_hears_a_few_and_later_turns_the_rest),
+	    CLAIM(a_status_is_built_ten_times_a_second_at_most),
+	    CLAIM(no_status_is_built_for_a_client_that_has_no_room_for_it),
 	    CLAIM(a_client_that_ends_its_half_still_gets_its_answers),
 	    CLAIM(a_stalled_client_does_not_hold_the_others_and_converges_when_it_reads),
 	    CLAIM(clients_that_vanish_in_a_batch_leave_nothing_behind),

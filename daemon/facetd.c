@@ -70,10 +70,10 @@ static char *read_file(const char *path, size_t *ret_len)
 	if (file && text)
 		n = fread(text, 1, CONFIG_BYTES_MAX + 1, file);
 	if (!file || !text || ferror(file)) {
-		fprintf(
-		    stderr,
-		    "facetd: %s: cannot be read (%s); give a configuration with --config; facetd --manual prints one with comments\n",
-		    path, strerror(errno ? errno : EIO));
+		fprintf(stderr,
+		        "facetd: %s: cannot be read (%s); give a configuration with --config; facetd --manual prints "
+		        "one with comments\n",
+		        path, strerror(errno ? errno : EIO));
 		free(text);
 		text = NULL;
 	} else if (n > CONFIG_BYTES_MAX) {

@@ -173,8 +173,8 @@ static int parse_tum(struct run *run, const struct bytes *bytes)
 			                text.line);
 		double length2 = v[4] * v[4] + v[5] * v[5] + v[6] * v[6] + v[7] * v[7];
 		if (!(length2 > 0.98 && length2 < 1.02))
-			return complain("%s:%u: qx qy qz qw have the length %.3g, a rotation has 1", run->options.pose_path,
-			                text.line, sqrt(length2));
+			return complain("%s:%u: qx qy qz qw have the length %.3g, a rotation has 1",
+			                run->options.pose_path, text.line, sqrt(length2));
 		struct quat q = quat_normalise((struct quat){v[7], v[4], v[5], v[6]});
 		run->pose[run->poses++] = transform_quat((struct vec3){v[1], v[2], v[3]}, q);
 		text_next_line(&text);

@@ -11,8 +11,8 @@
  *
  * A batch is the map as of the step at which it began. When an entry changes that the batch has not sent yet, its old
  * sheet is pinned: the batch sends pins after its cursor has come to the end. Nothing is copied for a client, and a
- * client that keeps up pins nothing. A batch that pins too much is aborted; the next one begins at the newest step:
- * a slow client skips what lies between and costs no memory (law L6).
+ * client that keeps up pins nothing. A batch that pins too many bytes or entries is aborted; the next one begins at the
+ * newest step: a slow client skips what lies between and costs no memory (law L6).
  *
  * Entries of patches that are gone stay, as the memory of their removal: there can be no more of them than the map,
  * which has a cap, ever had patches. Sequence numbers serve where steps would not: two sets may have one step. */
@@ -24,7 +24,8 @@
 #include <stdlib.h>
 #include <string.h>
 
-#define OUT_BYTES (32u << 10) /* gathered for one write */
+#define OUT_BYTES (32u << 10)                               /* gathered for one write */
+#define PINS_MAX  (PUBLISHER_PINS_MAX / sizeof(struct pin)) /* in the list of one batch */
 
 struct sheet {
 	unsigned references; /* of the store, pins and frames being written */
@@ -52,7 +53,7 @@ struct batch {
 	struct entry *cursor;      /* next to be sent; NULL: only pins are left */
 	struct pin *pin;
 	size_t pins, pins_sent, pins_cap;
-	size_t pinned; /* bytes of orphans among the pins not yet sent */
+	size_t pinned; /* bytes of orphans among the pins not yet sent, and of the list */
 };
 
 struct publisher_client {
@@ -193,6 +194,7 @@ static void pins_release(struct publisher *p, struct batch *batch)
 {
 	while (batch->pins_sent < batch->pins)
 		sheet_unref(p, batch->pin[batch->pins_sent++].sheet);
+	p->stats.pinned -= batch->pins * sizeof(*batch->pin);
 	free(batch->pin);
 	batch->pin = NULL;
 	batch->pins = batch->pins_sent = batch->pins_cap = batch->pinned = 0;
@@ -206,19 +208,33 @@ static void batch_abort(struct publisher_client *client)
 	client->batch.aborting = client->batch.active;
 }
 
-/* False when memory is out. */
-static bool batch_pin(struct batch *batch, const struct entry *entry)
+/* It is for the client to be slow, not for the server to remember: the next batch begins at the newest step. */
+static void batch_abort_slow(struct publisher_client *client)
+{
+	batch_abort(client);
+	client->stats.aborts++;
+	if (++client->aborts_running == PUBLISHER_ABORTS_MAX)
+		publisher_dismiss(client, "too slow: three batches running had to be aborted; read faster or "
+		                          "connect again");
+}
+
+/* False when memory is out. The list has room. */
+static bool batch_pin(struct publisher *p, struct batch *batch, const struct entry *entry)
 {
 	if (batch->pins == batch->pins_cap) {
 		size_t cap = batch->pins_cap ? batch->pins_cap * 2 : 64;
-		struct pin *grown = realloc(batch->pin, cap * sizeof(*grown));
+		struct pin *grown;
 
+		cap = cap > PINS_MAX ? PINS_MAX : cap;
+		grown = realloc(batch->pin, cap * sizeof(*grown));
 		if (!grown)
 			return false;
 		batch->pin = grown;
 		batch->pins_cap = cap;
 	}
 	batch->pin[batch->pins++] = (struct pin){entry->key, entry->sheet};
+	batch->pinned += sizeof(*batch->pin);
+	p->stats.pinned += sizeof(*batch->pin);
 	if (entry->sheet) {
 		entry->sheet->references++;
 		batch->pinned += entry->sheet->len;
@@ -239,7 +255,9 @@ static void before_change(struct publisher *p, struct entry *entry)
 			batch->cursor = entry->newer;
 		if (batch->cursor && batch->cursor->sequence > batch->end)
 			batch->cursor = NULL;
-		if (needed && !batch_pin(batch, entry))
+		if (needed && batch->pins == PINS_MAX)
+			batch_abort_slow(client);
+		else if (needed && !batch_pin(p, batch, entry))
 			batch_abort(client);
 	}
 }
@@ -302,11 +320,7 @@ static void limit_pins(struct publisher *p)
 				most = client;
 		if (!most)
 			return; /* what is left are frames half written, one a client */
-		batch_abort(most);
-		most->stats.aborts++;
-		if (++most->aborts_running == PUBLISHER_ABORTS_MAX)
-			publisher_dismiss(most, "too slow: three batches running had to be aborted; read faster or "
-			                        "connect again");
+		batch_abort_slow(most);
 	}
 }
 
@@ -664,8 +678,7 @@ void publisher_client_stats(const struct publisher_client *client, struct publis
 	*ret = client->stats;
 	ret->step = client->committed_step;
 	ret->behind_steps = behind(client);
-	ret->queued = client->out_len - client->out_at + client->source_left + client->json.len + client->batch.pinned +
-	              client->batch.pins_cap * sizeof(struct pin);
+	ret->queued = client->out_len - client->out_at + client->source_left + client->json.len + client->batch.pinned;
 }
 
 struct publisher *publisher_create(const struct publisher_params *params)

@@ -8,6 +8,7 @@
 #define PUBLISHER_PINNED_MAX \
 	(32u << 20)            /* bytes that live only because a batch pins them, over all clients; beyond, the
 					    batch that pins most is aborted and begun again at the newest step */
+#define PUBLISHER_PINS_MAX   (64u << 10) /* bytes of the list of pins of one client: beyond, likewise */
 #define PUBLISHER_ABORTS_MAX 3 /* so many running: the client is closed with the reason */
 #define PUBLISHER_JSON_MAX   (64u << 10) /* of one client, waiting; a message beyond is dropped and counted */
 
@@ -33,7 +34,7 @@ struct publisher_stats {
 	uint32_t generation;
 	size_t patches, bytes; /* living, encoded */
 	uint64_t faces, faces_raw;
-	size_t pinned; /* bytes that live only because they are pinned */
+	size_t pinned; /* bytes that live only because they are pinned, and of the lists of pins */
 	size_t clients;
 };
 void publisher_stats(const struct publisher *, struct publisher_stats *ret);

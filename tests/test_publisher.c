@@ -350,6 +350,97 @@ static void after_three_aborts_running_a_client_is_closed_with_the_reason(void *
 	publisher_destroy(p);
 }
 
+/* `n` patches of one triangle each, or of none, at a step of their own. */
+static void publish_many(struct publisher *p, uint64_t step, uint32_t n, uint32_t content)
+{
+	static struct patch *patch[4000];
+
+	for (uint32_t i = 0; i < n; i++)
+		patch[i] = make_patch(i, content, step, 1);
+	assert_int_equal(publisher_publish(p, step, patch, NULL, n), 0);
+	while (n > 0)
+		patch_unref(patch[--n]);
+}
+
+static void write_some(struct publisher_client *client, size_t capacity)
+{
+	const uint8_t *bytes;
+	size_t n;
+
+	while (capacity > 0 && (n = publisher_peek(client, 0, &bytes)) > 0) {
+		n = n < capacity ? n : capacity;
+		publisher_wrote(client, n, 0);
+		capacity -= n;
+	}
+}
+
+static void a_list_of_pins_is_counted_and_never_longer_than_64_kb(void **state)
+{
+	static struct history h;
+	struct publisher *p = start(&h, 1, 0);
+	struct native_want want = {0};
+	struct publisher_client *client = publisher_join(p, &want);
+	struct publisher_client_stats stats;
+	struct publisher_stats all;
+
+	(void)state;
+	publish_many(p, 1, 4000, 1);
+	for (uint64_t step = 2; step < 8; step += 2) {
+		size_t bytes;
+
+		assert_null(publisher_reason(client));
+		write_some(client, 40000); /* begins a batch, then stalls */
+		publisher_stats(p, &all);
+		bytes = all.pinned;
+		publish_many(p, step, 2600, 1);
+		publisher_client_stats(client, &stats);
+		publisher_stats(p, &all);
+		assert_int_equal(stats.aborts, step / 2 - 1);
+		assert_true(stats.queued < (256 << 10) + PUBLISHER_JSON_MAX);
+		assert_true(all.pinned - bytes > 1000 * 2 * sizeof(void *)); /* besides the sheets */
+		publish_many(p, step + 1, 4000, 1);
+		publisher_client_stats(client, &stats);
+		assert_int_equal(stats.aborts, step / 2);
+	}
+	assert_non_null(publisher_reason(client));
+	publisher_leave(client);
+	publisher_stats(p, &all);
+	assert_int_equal(all.pinned, 0);
+	publisher_destroy(p);
+}
+
+static void removals_under_a_stalled_client_are_limited_too(void **state)
+{
+	static struct history h;
+	struct publisher *p = start(&h, 1, 20000);
+	struct native_want want = {0};
+	struct publisher_client *client[3];
+	struct publisher_stats all;
+	uint64_t aborts = 0;
+
+	(void)state;
+	for (int i = 0; i < 3; i++)
+		client[i] = publisher_join(p, &want);
+	publish_many(p, 1, 2600, 1);
+	for (int i = 0; i < 3; i++)
+		write_some(client[i], SIZE_MAX);
+	publish_many(p, 2, 2600, 0); /* a batch of removals alone: what it pins are no sheets */
+	for (int i = 0; i < 3; i++)
+		write_some(client[i], 1000);
+	publish_many(p, 3, 2600, 1);
+	publisher_stats(p, &all);
+	assert_true(all.pinned <= 20000);
+	for (int i = 0; i < 3; i++) {
+		struct publisher_client_stats stats;
+
+		publisher_client_stats(client[i], &stats);
+		aborts += stats.aborts;
+		publisher_leave(client[i]);
+	}
+	assert_in_range(aborts, 1, 3);
+	publisher_destroy(p);
+}
+
 static void after_a_reset_every_client_begins_anew(void **state)
 {
 	static struct history h, after;
@@ -505,6 +596,8 @@ int main(void)
 	    cmocka_unit_test(a_late_joiner_gets_the_whole_map_as_one_batch_with_reset),
 	    cmocka_unit_test(a_stalled_client_costs_bounded_memory_and_skips_to_the_newest_state),
 	    cmocka_unit_test(after_three_aborts_running_a_client_is_closed_with_the_reason),
+	    cmocka_unit_test(a_list_of_pins_is_counted_and_never_longer_than_64_kb),
+	    cmocka_unit_test(removals_under_a_stalled_client_are_limited_too),
 	    cmocka_unit_test(after_a_reset_every_client_begins_anew),
 	    cmocka_unit_test(a_step_without_a_changed_patch_is_committed_too),
 	    cmocka_unit_test(the_counts_of_faces_and_patches_follow_the_map),

@@ -489,6 +489,8 @@ static void send_reason(struct publisher_client *client)
 	char text[256];
 	int n = snprintf(text, sizeof(text), "{\"class\":\"ERROR\",\"error\":\"%s\"}", client->reason);
 
+	if (!client->greeted)
+		client->json.len = 0; /* answers come after HELLO, which it will not get */
 	native_put_json(&client->small, text, (size_t)n);
 	send_small(client);
 	client->reason_sent = true;
@@ -513,7 +515,7 @@ static bool send_next(struct publisher_client *client, int64_t t_ns)
 	client->small.len = 0;
 	if (client->broken)
 		return false;
-	if (client->json.len > 0)
+	if (client->json.len > 0 && client->greeted)
 		send_json(client);
 	else if (client->reason_sent)
 		return false;

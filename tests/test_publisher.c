@@ -571,6 +571,37 @@ static void a_client_that_wants_a_rate_gets_no_more(void **state)
 	publisher_destroy(p);
 }
 
+static void nothing_but_the_reason_of_a_refusal_comes_before_hello(void **state)
+{
+	static struct history h;
+	struct publisher *p = start(&h, 50, 0);
+	struct native_want want = {.flags = 4, .region = {0, 0, 0, 1, 1, 1}};
+	struct publisher_client *client = publisher_join(p, &want), *refused = publisher_join(p, &want);
+	struct native_message message;
+	const uint8_t *bytes;
+	char error[128];
+	size_t n;
+
+	(void)state;
+	publisher_json(client, "{}", 2);
+	publisher_ping(client);
+	n = publisher_peek(client, 0, &bytes);
+	n = (size_t)native_scan(bytes, n, NATIVE_TO_CLIENT_MAX);
+	assert_int_equal(native_decode(bytes, n, &message, error), 0);
+	assert_int_equal(message.type, NATIVE_HELLO);
+	publisher_leave(client);
+	publisher_dismiss(refused, "full");
+	n = publisher_peek(refused, 0, &bytes);
+	assert_int_equal(native_scan(bytes, n, NATIVE_TO_CLIENT_MAX), n);
+	assert_int_equal(native_decode(bytes, n, &message, error), 0);
+	assert_int_equal(message.type, NATIVE_JSON);
+	native_message_finish(&message);
+	publisher_wrote(refused, n, 0);
+	assert_true(publisher_done(refused));
+	publisher_leave(refused);
+	publisher_destroy(p);
+}
+
 static void what_is_wanted_and_not_served_is_said(void **state)
 {
 	static struct history h;
@@ -603,6 +634,7 @@ int main(void)
 	    cmocka_unit_test(the_counts_of_faces_and_patches_follow_the_map),
 	    cmocka_unit_test(messages_come_between_frames_and_are_bounded),
 	    cmocka_unit_test(a_client_that_wants_a_rate_gets_no_more),
+	    cmocka_unit_test(nothing_but_the_reason_of_a_refusal_comes_before_hello),
 	    cmocka_unit_test(what_is_wanted_and_not_served_is_said),
 	};
 

@@ -19,7 +19,7 @@ CC_sanitize := clang
 CC_thread := clang
 CC_fuzz := clang
 CC := $(CC_$(config))
-FLAGS_release := -O2 -g
+FLAGS_release := -O3 -g
 FLAGS_debug := -O0 -g
 FLAGS_sanitize := -O1 -g -fsanitize=address,undefined -fno-sanitize-recover=all -fno-omit-frame-pointer
 FLAGS_thread := -O1 -g -fsanitize=thread -fno-omit-frame-pointer

@@ -1,13 +1,13 @@
 /* The loop.
  *
  *   device readable ─► supervisor ─► on_record: journal, pipeline ─► worker's queue
- *   10 Hz ───────────► on_tick:      journal, pipeline
+ *   10 Hz ───────────► on_tick:      journal, pipeline; was the wall clock set?
  *   worker ready ────► on_results:   publisher, then every client that has room
  *   second ──────────► on_second:    rates, the journal's disk
  *   watchdog ────────► on_watchdog:  only while the worker works or is idle
  *
  * Log time is taken here and nowhere else: realtime at the start plus what the monotonic clock has counted since, so it
- * never goes back and a corrected wall clock moves nothing. All records of one turn of a device carry one time.
+ * never goes back and a corrected wall clock moves nothing: only who sends us its time is told. All records of one turn of a device carry one time.
  *
  * The end: devices are stopped (a second at most), then sockets and handles are closed and the loop runs dry; whatever
  * hangs, LAST_MS after the signal everything is closed. */
@@ -34,6 +34,8 @@
 #include "daemon/worker.h"
 
 #define TICK_MS       100
+#define STEP_NS       1000000 /* the wall clock was set if it is off by more */
+#define LOOK_NS       200000  /* clocks that were read within so long belong together */
 #define LAST_MS       2000
 #define LATENCIES     1024 /* the newest, for the percentiles */
 #define RATE_SECONDS  4    /* rates are means over so long */
@@ -50,6 +52,7 @@ struct daemon {
 	const struct config *config;
 	uv_loop_t loop;
 	int64_t clock_offset_ns, started_ns; /* realtime - monotonic at the start */
+	int64_t wall_offset_ns;              /* the same now */
 	struct publisher *publisher;
 	struct worker *worker;
 	struct pipeline *pipeline;
@@ -88,6 +91,16 @@ static int64_t clock_ns(clockid_t clock)
 
 	clock_gettime(clock, &ts);
 	return (int64_t)ts.tv_sec * 1000000000 + ts.tv_nsec;
+}
+
+/* realtime - monotonic. False: the machine did something else in between, look again later. */
+static bool clock_offset(int64_t *ret_ns)
+{
+	int64_t before_ns = clock_ns(CLOCK_MONOTONIC), wall_ns = clock_ns(CLOCK_REALTIME);
+	int64_t after_ns = clock_ns(CLOCK_MONOTONIC);
+
+	*ret_ns = wall_ns - before_ns - (after_ns - before_ns) / 2;
+	return after_ns - before_ns <= LOOK_NS;
 }
 
 static int64_t now(void *ctx)
@@ -264,11 +277,29 @@ static void on_data(void *ctx, int device, int64_t t_ns)
 	supervisor_data(((struct daemon *)ctx)->supervisor, device, t_ns);
 }
 
+/* A step of the wall clock changes how poses are dated, so it is an entry of the journal (law L7). */
+static void look_for_step(struct daemon *d)
+{
+	int64_t offset_ns, step_ns;
+
+	if (!clock_offset(&offset_ns))
+		return;
+	step_ns = offset_ns - d->wall_offset_ns;
+	if (step_ns >= -STEP_NS && step_ns <= STEP_NS)
+		return;
+	log_line(LOG_NOTICE, "the wall clock was set by %+.3f s; the times of poses follow it", (double)step_ns / 1e9);
+	d->wall_offset_ns = offset_ns;
+	if (d->keep.clock)
+		d->keep.clock(d->keep.ctx, offset_ns - d->clock_offset_ns);
+	pipeline_clock(d->pipeline, offset_ns - d->clock_offset_ns);
+}
+
 static void on_tick(uv_timer_t *timer)
 {
 	struct daemon *d = timer->data;
 	int64_t t_ns = now(d);
 
+	look_for_step(d);
 	if (d->keep.tick)
 		d->keep.tick(d->keep.ctx, t_ns);
 	pipeline_tick(d->pipeline, t_ns);
@@ -631,7 +662,9 @@ int daemon_run(const struct config *config, const struct daemon_options *options
 	signal(SIGPIPE, SIG_IGN);
 	d->config = config;
 	d->error = error;
-	d->clock_offset_ns = clock_ns(CLOCK_REALTIME) - clock_ns(CLOCK_MONOTONIC);
+	for (int i = 0; i < 100 && !clock_offset(&d->clock_offset_ns); i++)
+		;
+	d->wall_offset_ns = d->clock_offset_ns;
 	d->started_ns = now(d);
 	if (getrandom(d->map_id, sizeof(d->map_id), GRND_NONBLOCK) < 0)
 		memcpy(d->map_id, &d->started_ns, sizeof(d->started_ns)); /* early at boot: the time will do */

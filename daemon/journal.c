@@ -5,6 +5,7 @@
  *   2  i64 log_ns                                                        a tick
  *   3  u64 number                                                        this row was not applied
  *   4                                                                    the map began anew
+ *   5  i64 ahead_ns                                                      the wall clock is now so far ahead of log time
  *
  * A row that was not applied is written after the record that completed it, but must be known before that record is
  * fed: journal_feed therefore looks ahead, up to the next reset, as numbers begin anew there. The file is mapped, not
@@ -24,7 +25,7 @@
 
 static const char MAGIC[8] = "FACETJ1\n";
 
-enum { ENTRY_RECORD = 1, ENTRY_TICK, ENTRY_NOT_APPLIED, ENTRY_RESET };
+enum { ENTRY_RECORD = 1, ENTRY_TICK, ENTRY_NOT_APPLIED, ENTRY_RESET, ENTRY_CLOCK };
 enum { RECORD_HEAD = 8 + 8 + 1 + 1 + 4, ENTRY_BYTES_MAX = 1 << 20 };
 
 struct journal {
@@ -75,6 +76,11 @@ static void keep_reset(void *ctx)
 	put_entry(ctx, ENTRY_RESET, NULL, 0);
 }
 
+static void keep_clock(void *ctx, int64_t ahead_ns)
+{
+	put_entry(ctx, ENTRY_CLOCK, &ahead_ns, 8);
+}
+
 struct journal *journal_create(const char *path, char error[160])
 {
 	struct journal *journal = calloc(1, sizeof(*journal));
@@ -103,7 +109,7 @@ void journal_destroy(struct journal *journal)
 
 void journal_sink(struct journal *journal, struct journal_sink *ret)
 {
-	*ret = (struct journal_sink){journal, keep_record, keep_tick, keep_not_applied, keep_reset};
+	*ret = (struct journal_sink){journal, keep_record, keep_tick, keep_not_applied, keep_reset, keep_clock};
 }
 
 int journal_error(const struct journal *journal)
@@ -122,13 +128,16 @@ struct entry {
 /* 1; 0 at the end (also within an entry); -EINVAL: no such entry. */
 static int entry_at(const uint8_t *data, size_t len, struct entry *ret)
 {
-	static const size_t fixed[] = {
-	    [ENTRY_RECORD] = RECORD_HEAD, [ENTRY_TICK] = 8, [ENTRY_NOT_APPLIED] = 8, [ENTRY_RESET] = 0};
+	static const size_t fixed[] = {[ENTRY_RECORD] = RECORD_HEAD,
+	                               [ENTRY_TICK] = 8,
+	                               [ENTRY_NOT_APPLIED] = 8,
+	                               [ENTRY_RESET] = 0,
+	                               [ENTRY_CLOCK] = 8};
 	uint32_t n = 0;
 
 	if (len == 0)
 		return 0;
-	if (data[0] < ENTRY_RECORD || data[0] > ENTRY_RESET)
+	if (data[0] < ENTRY_RECORD || data[0] > ENTRY_CLOCK)
 		return -EINVAL;
 	if (len < 1 + fixed[data[0]])
 		return 0;
@@ -178,7 +187,7 @@ static int feed_all(const uint8_t *data, size_t len, struct pipeline *pipeline, 
 {
 	int devices = pipeline_devices(pipeline);
 	struct entry entry;
-	int64_t log_ns;
+	int64_t ns;
 	int r;
 
 	feed_skips(data, len, pipeline);
@@ -188,8 +197,12 @@ static int feed_all(const uint8_t *data, size_t len, struct pipeline *pipeline, 
 		if (entry.kind == ENTRY_RECORD && feed_record(&entry, devices, pipeline) < 0)
 			return -EINVAL;
 		if (entry.kind == ENTRY_TICK) {
-			memcpy(&log_ns, entry.data, 8);
-			pipeline_tick(pipeline, log_ns);
+			memcpy(&ns, entry.data, 8);
+			pipeline_tick(pipeline, ns);
+		}
+		if (entry.kind == ENTRY_CLOCK) {
+			memcpy(&ns, entry.data, 8);
+			pipeline_clock(pipeline, ns);
 		}
 		if (entry.kind == ENTRY_RESET) {
 			pipeline_reset(pipeline);

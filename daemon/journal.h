@@ -11,6 +11,7 @@ struct journal_sink {
 	void (*tick)(void *ctx, int64_t log_ns);
 	void (*not_applied)(void *ctx, uint64_t number);
 	void (*reset)(void *ctx); /* the map began anew here */
+	void (*clock)(void *ctx, int64_t ahead_ns);
 };
 
 /* A list kept in a file (tests, `facetd --journal FILE` for them): plain bytes, described in journal.c. */

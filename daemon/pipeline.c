@@ -207,6 +207,14 @@ void pipeline_tick(struct pipeline *p, int64_t log_ns)
 	advance(p, false);
 }
 
+/* Only what decoders read from now on is concerned; the tick that follows has the time. */
+void pipeline_clock(struct pipeline *p, int64_t ahead_ns)
+{
+	for (int i = 0; i < p->config->devices; i++)
+		if (p->device[i].driver->clock)
+			p->device[i].driver->clock(p->device[i].decoder, ahead_ns);
+}
+
 void pipeline_end(struct pipeline *p)
 {
 	advance(p, true);

@@ -2,7 +2,7 @@
  *
  *   record -> decoder -> profile | tilt | pose -> assembler -> row, numbered -> row sink (the worker's queue, or a map)
  *
- * Driven by records and ticks only (law L7): the same list of records gives the same rows, live or kept. */
+ * Driven by records, ticks and steps of the wall clock only (law L7): the same list gives the same rows, live or kept. */
 #ifndef FACET_DAEMON_PIPELINE_H
 #define FACET_DAEMON_PIPELINE_H
 
@@ -30,9 +30,10 @@ struct pipeline *pipeline_create(const struct config *, const struct pipeline_si
 void pipeline_destroy(struct pipeline *);
 
 void pipeline_handle(struct pipeline *, const struct record *);
-void pipeline_tick(struct pipeline *, int64_t log_ns);  /* the recorded 10 Hz tick */
-void pipeline_skip(struct pipeline *, uint64_t number); /* replay: this row was not applied live */
-void pipeline_end(struct pipeline *);                   /* end of the input: hand out what waits, then flush */
+void pipeline_tick(struct pipeline *, int64_t log_ns);    /* the recorded 10 Hz tick */
+void pipeline_clock(struct pipeline *, int64_t ahead_ns); /* the wall clock was set: so far ahead of log time now */
+void pipeline_skip(struct pipeline *, uint64_t number);   /* replay: this row was not applied live */
+void pipeline_end(struct pipeline *);                     /* end of the input: hand out what waits, then flush */
 void pipeline_reset(
     struct pipeline *); /* a new map: rows are numbered from 0 again, the numbers to skip are forgotten */
 

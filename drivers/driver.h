@@ -81,6 +81,8 @@ struct driver {
 	void (*decoder_destroy)(struct decoder *);
 	void (*decode)(struct decoder *, const struct record *, const struct record_sink *);
 	void (*counters)(const struct decoder *, struct decoder_counters *ret);
+	/* The wall clock was set: it is now `ahead_ns` ahead of the times of records. NULL: it matters not. */
+	void (*clock)(struct decoder *, int64_t ahead_ns);
 
 	/* NULL for devices that need no dialogue. `config` (all of it) because a servo needs the sweep. */
 	struct dialogue *(*dialogue_create)(const struct config *, int device);

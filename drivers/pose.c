@@ -22,6 +22,7 @@
 
 struct decoder {
 	int index;
+	int64_t ahead_ns; /* the wall clock, of the times of records: 0 until somebody sets it */
 	uint64_t count[POSE_LINE_VERDICTS];
 };
 
@@ -47,10 +48,18 @@ static void decode(struct decoder *d, const struct record *record, const struct 
 
 	if (record->direction != FROM_DEVICE)
 		return;
-	verdict = pose_line_parse((const char *)record->bytes, record->len, record->t_ns, &pose);
+	verdict = pose_line_parse((const char *)record->bytes, record->len, record->t_ns + d->ahead_ns, &pose);
 	d->count[verdict]++;
-	if (verdict == POSE_LINE_OK)
-		sink->pose(sink->ctx, d->index, &pose);
+	if (verdict != POSE_LINE_OK)
+		return;
+	pose.t_ns -= d->ahead_ns;
+	sink->pose(sink->ctx, d->index, &pose);
+}
+
+/* Senders say the wall clock's time. */
+static void follow_clock(struct decoder *d, int64_t ahead_ns)
+{
+	d->ahead_ns = ahead_ns;
 }
 
 static void counters(const struct decoder *d, struct decoder_counters *ret)
@@ -217,6 +226,7 @@ const struct driver driver_pose = {
     .decoder_destroy = decoder_destroy,
     .decode = decode,
     .counters = counters,
+    .clock = follow_clock,
     .link_open = link_open,
     .link_fd = link_fd,
     .link_read = link_read,

@@ -22,6 +22,7 @@
 struct decoder {
 	int device;
 	uint64_t seen;
+	int64_t ahead_ns;
 };
 
 static struct decoder *fake_create(const struct config_device *config, int device)
@@ -68,7 +69,7 @@ static void fake_decode(struct decoder *decoder, const struct record *record, co
 		sink->tilt(sink->ctx, decoder->device, &tilt);
 		break;
 	case 'P':
-		pose.t_ns = t_ns;
+		pose.t_ns = t_ns - decoder->ahead_ns;
 		pose.position_m.x = value;
 		sink->pose(sink->ctx, decoder->device, &pose);
 		break;
@@ -76,6 +77,11 @@ static void fake_decode(struct decoder *decoder, const struct record *record, co
 		sink->reply(sink->ctx, decoder->device, &reply);
 		break;
 	}
+}
+
+static void fake_clock(struct decoder *decoder, int64_t ahead_ns)
+{
+	decoder->ahead_ns = ahead_ns;
 }
 
 static void fake_counters(const struct decoder *decoder, struct decoder_counters *ret)
@@ -103,7 +109,8 @@ static const struct driver fakes[] = {
      .decoder_create = fake_create,
      .decoder_destroy = fake_destroy,
      .decode = fake_decode,
-     .counters = fake_counters},
+     .counters = fake_counters,
+     .clock = fake_clock},
 };
 
 const struct driver *const driver_table[] = {&fakes[0], &fakes[1], &fakes[2], NULL};
@@ -151,6 +158,7 @@ struct outcome {
 	struct buffer text;
 	int refuse_from, refuse_to, rows, replies, datas; /* rows refused by their place in the list of all rows */
 	int64_t arrival_ns;
+	int64_t ahead_ns; /* the wall clock, by which poses are dated */
 };
 
 static bool on_row(void *ctx, struct row *row)
@@ -238,17 +246,25 @@ static void tick(struct outcome *o, int64_t log_ns)
 	pipeline_tick(o->pipeline, log_ns);
 }
 
+static void set_clock(struct outcome *o, int64_t ahead_ns)
+{
+	o->ahead_ns = ahead_ns;
+	if (o->journal.clock)
+		o->journal.clock(o->journal.ctx, ahead_ns);
+	pipeline_clock(o->pipeline, ahead_ns);
+}
+
 /* `n` turns of both lasers from t_ns on, with angles and poses around them. */
 static void play(struct outcome *o, int64_t t_ns, int n)
 {
 	for (int i = 0; i < n; i++, t_ns += 13 * MS) {
-		give(o, POSE, 'P', t_ns, t_ns, 0.01 * i);
+		give(o, POSE, 'P', t_ns, t_ns + o->ahead_ns, 0.01 * i);
 		give(o, TILT_A, 'T', t_ns, t_ns, 0.001 * i);
 		give(o, TILT_B, 'T', t_ns, t_ns, -0.001 * i);
 		give(o, LASER_A, 'L', t_ns + 3 * MS, t_ns, 2 + 0.1 * i);
 		give(o, LASER_B, 'L', t_ns + 4 * MS, t_ns + MS, 3 + 0.1 * i);
 	}
-	give(o, POSE, 'P', t_ns, t_ns, 0.01 * n);
+	give(o, POSE, 'P', t_ns, t_ns + o->ahead_ns, 0.01 * n);
 	give(o, TILT_A, 'T', t_ns, t_ns, 0.001 * n);
 	give(o, TILT_B, 'T', t_ns, t_ns, -0.001 * n);
 }
@@ -432,6 +448,47 @@ static void a_kept_list_gives_the_same_rows_again(void **state)
 	close_outcome(&live);
 }
 
+/* Three drives, the wall clock set before the second and the third. */
+static void drive_through_steps(struct outcome *o, const int64_t ahead_ns[3])
+{
+	for (int i = 0; i < 3; i++) {
+		if (o->ahead_ns != ahead_ns[i])
+			set_clock(o, ahead_ns[i]);
+		play(o, (1000 + 1000 * i) * MS, 10);
+		tick(o, (1900 + 1000 * i) * MS);
+	}
+	terminate(o);
+}
+
+static void a_step_of_the_wall_clock_changes_no_row_live_or_kept(void **state)
+{
+	static const int64_t none[3] = {0}, steps[3] = {0, 3600000 * MS, -5 * MS};
+	struct outcome steady, live, again;
+	char path[64], error[160] = "";
+	struct journal *journal;
+
+	(void)state;
+	make_path(path);
+	open_outcome(&steady);
+	drive_through_steps(&steady, none);
+	assert_int_equal(count(&steady, "row "), 60);
+	open_outcome(&live);
+	journal = journal_create(path, error);
+	assert_non_null(journal);
+	journal_sink(journal, &live.journal);
+	drive_through_steps(&live, steps);
+	journal_destroy(journal);
+	assert_string_equal((char *)steady.text.data, (char *)live.text.data);
+	open_outcome(&again);
+	assert_int_equal(journal_feed(path, again.pipeline, NULL, NULL, error), 0);
+	terminate(&again);
+	assert_string_equal((char *)live.text.data, (char *)again.text.data);
+	unlink(path);
+	close_outcome(&again);
+	close_outcome(&live);
+	close_outcome(&steady);
+}
+
 static void a_list_cut_anywhere_is_fed_up_to_its_last_whole_entry(void **state)
 {
 	struct outcome live, again;
@@ -500,6 +557,7 @@ int main(void)
 	    cmocka_unit_test(latency_counts_from_the_last_byte_of_the_rows_own_profile),
 	    cmocka_unit_test(replies_and_counters_are_those_of_their_device),
 	    cmocka_unit_test(a_kept_list_gives_the_same_rows_again),
+	    cmocka_unit_test(a_step_of_the_wall_clock_changes_no_row_live_or_kept),
 	    cmocka_unit_test(a_list_cut_anywhere_is_fed_up_to_its_last_whole_entry),
 	    cmocka_unit_test(a_list_of_other_devices_is_refused),
 	    cmocka_unit_test(a_journal_that_cannot_be_written_says_so),

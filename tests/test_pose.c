@@ -339,6 +339,42 @@ static void verdicts_are_counted_by_reason(void **state)
 	driver_pose.decoder_destroy(decoder);
 }
 
+/* The pose that a line of this time gives, which arrives at T0; 0: it is refused. */
+static int64_t dated(struct decoder *decoder, const char *t)
+{
+	struct pose pose = {0};
+	struct record_sink sink = {.ctx = &pose, .pose = take_pose};
+	char line[128];
+	int n = snprintf(line, sizeof line, "{%s\"position\": [4,0,0], \"orientation\": [0,0,0,1]}", t);
+	struct record record = {.t_ns = T0, .bytes = (const uint8_t *)line, .len = (size_t)n};
+
+	driver_pose.decode(decoder, &record, &sink);
+	return pose.t_ns;
+}
+
+static void times_follow_the_wall_clock_when_it_is_set(void **state)
+{
+	struct config_device device = {.name = "pose"};
+	struct decoder *decoder = driver_pose.decoder_create(&device, 3);
+	struct decoder_counters counters;
+
+	(void)state;
+	assert_int_equal(dated(decoder, "\"t\": 1732200000.25, "), T0 - 250000000);
+	assert_int_equal(dated(decoder, "\"t\": 1732203600.25, "), 0);
+	driver_pose.clock(decoder, INT64_C(3600000000000)); /* an hour forward */
+	assert_int_equal(dated(decoder, "\"t\": 1732203600.25, "), T0 - 250000000);
+	assert_int_equal(dated(decoder, "\"t\": 1732200000.25, "), 0);
+	assert_int_equal(dated(decoder, ""), T0);        /* the arrival has nothing to do with it */
+	driver_pose.clock(decoder, -INT64_C(500000000)); /* and back beyond the first */
+	assert_int_equal(dated(decoder, "\"t\": 1732199999.75, "), T0 - 250000000);
+	driver_pose.clock(decoder, 0);
+	assert_int_equal(dated(decoder, "\"t\": 1732200000.25, "), T0 - 250000000);
+	driver_pose.counters(decoder, &counters);
+	assert_int_equal(counters.counter[POSE_LINE_OK].count, 5);
+	assert_int_equal(counters.counter[POSE_LINE_TIME].count, 2);
+	driver_pose.decoder_destroy(decoder);
+}
+
 int main(void)
 {
 	const struct CMUnitTest tests[] = {
@@ -357,6 +393,7 @@ int main(void)
 	    cmocka_unit_test(a_path_too_long_for_a_socket_is_refused_not_cut),
 	    cmocka_unit_test(a_fixed_pose_needs_no_descriptor),
 	    cmocka_unit_test(verdicts_are_counted_by_reason),
+	    cmocka_unit_test(times_follow_the_wall_clock_when_it_is_set),
 	};
 
 	return cmocka_run_group_tests(tests, make_dir, remove_dir);

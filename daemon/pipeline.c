@@ -31,6 +31,7 @@ struct scanner {
 		int64_t t_ns, log_ns;
 	} arrival[ARRIVALS]; /* ring: first beam -> log time of the last byte */
 	unsigned arrivals;
+	bool begins; /* the row that began a sweep was not applied: the next one does */
 };
 
 struct pipeline {
@@ -133,25 +134,30 @@ static int64_t arrival_of(const struct pipeline *p, const struct scanner *scanne
 	return p->log_ns;
 }
 
-static void hand_out(struct pipeline *p, const struct scanner *scanner, struct row *row)
+static void hand_out(struct pipeline *p, struct scanner *scanner, struct row *row)
 {
 	uint64_t number = p->next_number++;
+	bool begins = row->starts_sweep || scanner->begins;
 
 	row->number = number;
+	row->starts_sweep = begins;
+	scanner->begins = false;
 	p->rows++;
 	p->last_row_ns = p->log_ns;
 	p->rows_since_flush = true;
 	p->arrival_ns = arrival_of(p, scanner, row->t_ns);
 	if (skipped(p, number)) {
 		row_destroy(row);
+		scanner->begins = begins;
 		report_not_applied(p, number, "skipped");
 	} else if (!p->sink.row(p->sink.ctx, row)) {
 		row_destroy(row);
+		scanner->begins = begins;
 		report_not_applied(p, number, "queue full");
 	}
 }
 
-static void advance_scanner(struct pipeline *p, const struct scanner *scanner, bool end)
+static void advance_scanner(struct pipeline *p, struct scanner *scanner, bool end)
 {
 	for (;;) {
 		struct row *row = NULL;

@@ -169,8 +169,8 @@ static bool on_row(void *ctx, struct row *row)
 	o->arrival_ns = pipeline_arrival_ns(o->pipeline);
 	if (place >= o->refuse_from && place < o->refuse_to)
 		return false;
-	buffer_printf(&o->text, "row %llu raster %u t %lld", (unsigned long long)row->number, row->raster,
-	              (long long)row->t_ns);
+	buffer_printf(&o->text, "row %llu raster %u%s t %lld", (unsigned long long)row->number, row->raster,
+	              row->starts_sweep ? " starts" : "", (long long)row->t_ns);
 	for (uint32_t i = 0; i < row->n; i++)
 		buffer_printf(&o->text, " %.17g,%.17g,%.17g", row->beam[i].point.x, row->beam[i].point.y,
 		              row->beam[i].point.z);
@@ -307,6 +307,30 @@ static void rows_are_numbered_over_all_scanners(void **state)
 	assert_int_equal(count(&o, "raster 1"), 10);
 	assert_int_equal(o.datas, 53);
 	close_outcome(&o);
+}
+
+/* The first rows of both scanners are not applied: by the sink's refusal, or told beforehand. */
+static void the_beginning_of_a_sweep_outlives_the_row_that_carried_it(void **state)
+{
+	struct outcome live, again;
+
+	(void)state;
+	open_outcome(&live);
+	live.refuse_to = 5;
+	play(&live, 1000 * MS, 10);
+	terminate(&live);
+	assert_int_equal(count(&live, "row "), 15);
+	assert_int_equal(count(&live, "starts"), 2);
+	assert_int_equal(count(&live, "row 5 raster 1 starts"), 1);
+	assert_int_equal(count(&live, "row 6 raster 0 starts"), 1);
+	open_outcome(&again);
+	for (uint64_t number = 0; number < 5; number++)
+		pipeline_skip(again.pipeline, number);
+	play(&again, 1000 * MS, 10);
+	terminate(&again);
+	assert_string_equal((char *)live.text.data, (char *)again.text.data);
+	close_outcome(&live);
+	close_outcome(&again);
 }
 
 static void an_angle_reaches_only_the_scanner_on_that_servo(void **state)
@@ -552,6 +576,7 @@ int main(void)
 {
 	const struct CMUnitTest tests[] = {
 	    cmocka_unit_test(rows_are_numbered_over_all_scanners),
+	    cmocka_unit_test(the_beginning_of_a_sweep_outlives_the_row_that_carried_it),
 	    cmocka_unit_test(an_angle_reaches_only_the_scanner_on_that_servo),
 	    cmocka_unit_test(a_second_without_a_row_flushes_once),
 	    cmocka_unit_test(latency_counts_from_the_last_byte_of_the_rows_own_profile),

@@ -1,8 +1,4 @@
-/* Opening where clients connect.
- *
- * A unix socket's file survives the program that made it. Whether one that is there is alive is asked by connecting: who
- * refuses is dead, and its file is removed; a file that is no socket never is. The umask is set around bind, because
- * between bind and a chmod anybody could connect. */
+/* Opening where clients connect: unix sockets for a group, TCP on loopback only. */
 #include "daemon/listener.h"
 
 #include <errno.h>
@@ -13,6 +9,8 @@
 #include <sys/socket.h>
 #include <sys/un.h>
 #include <unistd.h>
+
+#include "drivers/unix_socket.h"
 
 #define BACKLOG 64
 
@@ -44,36 +42,6 @@ static const char *explain_bind(int r)
 	}
 }
 
-static bool answers(const struct sockaddr_un *address)
-{
-	int fd = socket(AF_UNIX, SOCK_STREAM | SOCK_CLOEXEC | SOCK_NONBLOCK, 0);
-	bool alive =
-	    fd < 0 || connect(fd, (const struct sockaddr *)address, sizeof(*address)) == 0 || errno != ECONNREFUSED;
-
-	if (fd >= 0)
-		close(fd);
-	return alive;
-}
-
-static int bind_unix(int fd, const struct sockaddr_un *address)
-{
-	mode_t before = umask(0117); /* 0660 */
-	int r = bind(fd, (const struct sockaddr *)address, sizeof(*address)) < 0 ? -errno : 0;
-	struct stat st;
-	bool is_socket = r == -EADDRINUSE && lstat(address->sun_path, &st) == 0 && S_ISSOCK(st.st_mode);
-
-	if (r == -EADDRINUSE && !is_socket) {
-		r = -ENOTSOCK;
-	} else if (is_socket && !answers(address)) {
-		if (unlink(address->sun_path) < 0)
-			r = -errno;
-		else
-			r = bind(fd, (const struct sockaddr *)address, sizeof(*address)) < 0 ? -errno : 0;
-	}
-	umask(before);
-	return r;
-}
-
 static void give_to_group(const char *path, const char *name)
 {
 	struct group *group = name[0] ? getgrnam(name) : NULL;
@@ -94,7 +62,7 @@ static int open_unix(struct listener *l, const char *group, char error[320])
 	l->fd = socket(AF_UNIX, SOCK_STREAM | SOCK_NONBLOCK | SOCK_CLOEXEC, 0);
 	if (l->fd < 0)
 		return refuse(l, -errno, strerror(errno), error);
-	r = bind_unix(l->fd, &address);
+	r = unix_socket_bind(l->fd, &address);
 	if (r < 0)
 		return refuse(l, r, explain_bind(r), error);
 	give_to_group(l->address.path, group);

@@ -19,6 +19,7 @@
 
 #include "config/address.h"
 #include "drivers/driver.h"
+#include "drivers/unix_socket.h"
 
 struct decoder {
 	int index;
@@ -79,33 +80,6 @@ struct link {
 	ino_t ino;
 };
 
-/* Does anybody receive at this path? */
-static bool is_alive(const struct sockaddr_un *address)
-{
-	int fd = socket(AF_UNIX, SOCK_DGRAM | SOCK_CLOEXEC, 0);
-	bool alive =
-	    fd < 0 || connect(fd, (const struct sockaddr *)address, sizeof *address) == 0 || errno != ECONNREFUSED;
-
-	if (fd >= 0)
-		close(fd);
-	return alive;
-}
-
-/* Binds, once more after the file of a dead program was removed. */
-static int bind_path(int fd, const struct sockaddr_un *address)
-{
-	struct stat st;
-
-	if (bind(fd, (const struct sockaddr *)address, sizeof *address) == 0)
-		return 0;
-	if (errno != EADDRINUSE || lstat(address->sun_path, &st) < 0 || !S_ISSOCK(st.st_mode) || is_alive(address))
-		return -errno;
-	if (unlink(address->sun_path) < 0 || bind(fd, (const struct sockaddr *)address, sizeof *address) < 0)
-		return -errno;
-	return 0;
-}
-
-/* The mode is set before the file appears, and again after it for a umask that took the group's part. */
 static int open_unix(struct link *link, const char *path, char error[160])
 {
 	struct sockaddr_un address = {.sun_family = AF_UNIX};
@@ -114,18 +88,15 @@ static int open_unix(struct link *link, const char *path, char error[160])
 
 	strcpy(address.sun_path, path);
 	link->fd = socket(AF_UNIX, SOCK_DGRAM | SOCK_NONBLOCK | SOCK_CLOEXEC, 0);
-	r = link->fd < 0 ? -errno : 0;
-	if (!r) {
-		fchmod(link->fd, 0660);
-		r = bind_path(link->fd, &address);
-	}
+	r = link->fd < 0 ? -errno : unix_socket_bind(link->fd, &address);
 	if (r) {
 		snprintf(error, 160, "unix:%.90s: %s", path,
-		         r == -EADDRINUSE ? "somebody listens there already, or it is no socket" : strerror(-r));
+		         r == -EADDRINUSE ? "somebody listens there already"
+		         : r == -ENOTSOCK ? "a file that is no socket stands there"
+		                          : strerror(-r));
 		return -1;
 	}
 	strcpy(link->path, path);
-	chmod(path, 0660);
 	link->bound = lstat(path, &st) == 0;
 	if (link->bound) {
 		link->dev = st.st_dev;

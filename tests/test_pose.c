@@ -233,6 +233,7 @@ static void a_file_that_is_no_socket_is_never_removed(void **state)
 	assert_non_null(file);
 	fclose(file);
 	assert_null(driver_pose.link_open(&device, error));
+	assert_non_null(strstr(error, "no socket"));
 	assert_int_equal(access(address.sun_path, F_OK), 0);
 	unlink(address.sun_path);
 }

@@ -699,10 +699,10 @@ enum sweep_verdict sweep_next(struct sweep *s, int64_t log_ns, bool end, struct 
 	struct recipe recipe = parts > 1 ? recipe_of_parts(s, parts) : recipe_of_turns(p, s->turn, s->turns);
 	struct row *row = NULL;
 	int r = make_row(s, &recipe, &row);
-	if (r < 0)
-		return SWEEP_NOMEM;
 	if (++s->turn == s->turns)
 		held_pop(s, parts);
+	if (r < 0)
+		return SWEEP_NOMEM;
 	if (r > 0)
 		return dropped(s, (enum sweep_drop)(r - 1), ret_drop);
 	row->ends_sweep = end && s->waiting == 0;

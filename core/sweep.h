@@ -36,7 +36,7 @@ enum sweep_verdict {
 	SWEEP_WAIT,    /* nothing to hand out now */
 	SWEEP_ROW,     /* *ret_row is a row, the caller's; number not yet set */
 	SWEEP_DROPPED, /* a row's worth of beams was dropped; *ret_drop says why */
-	SWEEP_NOMEM
+	SWEEP_NOMEM    /* a row is lost; the next call goes on behind it */
 };
 
 struct sweep;

@@ -174,7 +174,7 @@ static void advance_scanner(struct pipeline *p, struct scanner *scanner, bool en
 			break;
 		case SWEEP_NOMEM:
 			report_not_applied(p, p->next_number++, "out of memory");
-			return;
+			break;
 		}
 	}
 }

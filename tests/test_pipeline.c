@@ -15,6 +15,7 @@
 #include "core/model.h"
 #include "daemon/journal.h"
 #include "daemon/pipeline.h"
+#include "tests/scarce.h"
 
 #define MS 1000000ll
 
@@ -333,6 +334,47 @@ static void the_beginning_of_a_sweep_outlives_the_row_that_carried_it(void **sta
 	close_outcome(&again);
 }
 
+/* A turn of both lasers that waits for later samples. */
+static void begin_turn(struct outcome *o)
+{
+	give(o, POSE, 'P', 1000 * MS, 1000 * MS, 0);
+	give(o, TILT_A, 'T', 990 * MS, 990 * MS, 0);
+	give(o, TILT_B, 'T', 990 * MS, 990 * MS, 0);
+	give(o, TILT_A, 'T', 1000 * MS, 1000 * MS, 0);
+	give(o, TILT_B, 'T', 1000 * MS, 1000 * MS, 0);
+	give(o, LASER_A, 'L', 1003 * MS, 1000 * MS, 2);
+	give(o, LASER_B, 'L', 1004 * MS, 1000 * MS, 3);
+}
+
+static void a_row_lost_to_want_of_memory_costs_one_number_and_a_replay_keeps_step(void **state)
+{
+	struct outcome live, again;
+	struct pipeline_stats stats;
+
+	(void)state;
+	if (!SCARCE_WORKS)
+		skip();
+	open_outcome(&live);
+	begin_turn(&live);
+	scarce_left = 0;
+	pipeline_end(live.pipeline);
+	assert_int_equal(scarce_left, -1);
+	play(&live, 1500 * MS, 5);
+	terminate(&live);
+	pipeline_stats(live.pipeline, &stats);
+	assert_int_equal(stats.not_applied, 1);
+	assert_int_equal(count(&live, "row "), 11);
+	open_outcome(&again);
+	pipeline_skip(again.pipeline, 0);
+	begin_turn(&again);
+	pipeline_end(again.pipeline);
+	play(&again, 1500 * MS, 5);
+	terminate(&again);
+	assert_string_equal((char *)live.text.data, (char *)again.text.data);
+	close_outcome(&live);
+	close_outcome(&again);
+}
+
 static void an_angle_reaches_only_the_scanner_on_that_servo(void **state)
 {
 	struct outcome o;
@@ -577,6 +619,7 @@ int main(void)
 	const struct CMUnitTest tests[] = {
 	    cmocka_unit_test(rows_are_numbered_over_all_scanners),
 	    cmocka_unit_test(the_beginning_of_a_sweep_outlives_the_row_that_carried_it),
+	    cmocka_unit_test(a_row_lost_to_want_of_memory_costs_one_number_and_a_replay_keeps_step),
 	    cmocka_unit_test(an_angle_reaches_only_the_scanner_on_that_servo),
 	    cmocka_unit_test(a_second_without_a_row_flushes_once),
 	    cmocka_unit_test(latency_counts_from_the_last_byte_of_the_rows_own_profile),

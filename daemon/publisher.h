@@ -6,10 +6,10 @@
 #include "core/native.h"
 
 #define PUBLISHER_PINNED_MAX \
-	(32u << 20)            /* bytes that live only because a batch pins them, over all clients; beyond, the
+	(32u << 20) /* bytes that live only because a batch pins them, over all clients; beyond, the
 					    batch that pins most is aborted and begun again at the newest step */
 #define PUBLISHER_PINS_MAX   (64u << 10) /* bytes of the list of pins of one client: beyond, likewise */
-#define PUBLISHER_ABORTS_MAX 3 /* so many running: the client is closed with the reason */
+#define PUBLISHER_ABORTS_MAX 3           /* so many running: the client is closed with the reason */
 #define PUBLISHER_JSON_MAX   (64u << 10) /* of one client, waiting; a message beyond is dropped and counted */
 
 struct publisher_params {

@@ -308,8 +308,12 @@ int client_commit(struct client *client, int timeout_ms, char error[CLIENT_ERROR
 
 int client_say(struct client *client, const char *line, char error[CLIENT_ERROR_MAX])
 {
-	const int status = send_all(client, line, strlen(line), error);
-	return status ? status : send_all(client, "\n", 1, error);
+	struct buffer bytes = {0};
+	buffer_printf(&bytes, "%s\n", line); /* in one piece: who answers the line may close before a second one arrives */
+	const int status =
+	    bytes.error ? fail(error, -ENOMEM, "memory is out") : send_all(client, bytes.data, bytes.len, error);
+	buffer_finish(&bytes);
+	return status;
 }
 
 int client_line(struct client *client, int timeout_ms, const char **ret_line, char error[CLIENT_ERROR_MAX])

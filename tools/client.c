@@ -309,7 +309,8 @@ int client_commit(struct client *client, int timeout_ms, char error[CLIENT_ERROR
 int client_say(struct client *client, const char *line, char error[CLIENT_ERROR_MAX])
 {
 	struct buffer bytes = {0};
-	buffer_printf(&bytes, "%s\n", line); /* in one piece: who answers the line may close before a second one arrives */
+	/* In one piece: who answers the line may close before a second one arrives. */
+	buffer_printf(&bytes, "%s\n", line);
 	const int status =
 	    bytes.error ? fail(error, -ENOMEM, "memory is out") : send_all(client, bytes.data, bytes.len, error);
 	buffer_finish(&bytes);

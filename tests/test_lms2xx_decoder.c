@@ -140,8 +140,10 @@ static int teardown(void **state)
 static void the_real_telegram_decodes_as_documented(void **state)
 {
 	struct rig *rig = *state;
-	if (rig->real[7] != 0xCB)
+	if (rig->real[7] != 0xCB) {
+		print_message("note: the real telegram (../shared/data/captures/lms2xx) is not here: SKIPPED\n");
 		skip();
+	}
 	tell_mode(rig,
 	          0x02); /* 13 bit and three field flags: this room is 0.5 .. 4.7 m, the last third stands in a field */
 	feed(rig, FROM_DEVICE, rig->real, rig->real_len);

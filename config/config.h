@@ -28,7 +28,7 @@ struct config_register { /* a Modbus value */
 
 struct config_device {
 	char name[CONFIG_NAME_MAX];
-	char driver[CONFIG_NAME_MAX]; /* lms2xx, modbus, pose */
+	char driver[CONFIG_NAME_MAX]; /* a name of keys_driver */
 	int line;                     /* of the file, for messages */
 
 	/* lms2xx */
@@ -46,8 +46,28 @@ struct config_device {
 	char tilt[CONFIG_NAME_MAX]; /* name of the device that tilts this one; empty: fixed */
 	double tilt_fixed_rad;
 
-	/* modbus */
-	char connect[CONFIG_TEXT_MAX]; /* path of a serial line (RTU) or host:port (TCP) */
+	enum { INDICES_KEEP, INDICES_ON } indices; /* lms2xx: real-time indices; setting them writes its memory */
+
+	/* every scanner */
+	int64_t latency_ns; /* how much earlier a profile was measured than its time says: calibrated, may be negative */
+
+	/* tim, lms1xx, lms5xx; 0: as the device is set */
+	enum { PROTOCOL_AUTO, PROTOCOL_COLA_A, PROTOCOL_COLA_B } protocol;
+	double frequency_hz, resolution_rad;
+	double angles_from_rad, angles_to_rad; /* output range; 0 is straight ahead, positive left. Equal: as it is */
+	int every;                             /* every n-th scan is sent */
+	enum { REMISSION_KEEP, REMISSION_OFF, REMISSION_8, REMISSION_16 } remission;
+	enum { STAMP_AUTO, STAMP_START, STAMP_END } stamp; /* what the device's stamp marks; auto: by the model */
+	struct {
+		bool set;
+		double scale; /* rad of a tick; angle = sign * scale * (ticks - zero) */
+		double zero;  /* ticks */
+		int sign;
+		double wrap; /* ticks after which they count from 0 again; 0: 2^32 */
+	} encoder; /* in the telegrams; the device may then be its own `tilt` */
+
+	/* modbus: path of a serial line (RTU) or HOST:PORT (TCP). Scanners: HOST[:PORT], usb, usb:SERIAL, usb:BUS-PORT */
+	char connect[CONFIG_TEXT_MAX];
 	char parity;                   /* N, E, O */
 	int slave;                     /* `unit` of a Modbus device, 1..247 */
 	int64_t period_ns;             /* between polls; 0: as fast as the answers come */

@@ -113,7 +113,7 @@ const struct key key_table[] = {
 };
 /* clang-format on */
 
-static const char *const driver_names[] = {"lms2xx", "modbus", "pose", NULL};
+static const char *const driver_names[] = {"lms2xx", "modbus", "pose", "tim", "lms1xx", "lms5xx", NULL};
 
 unsigned keys_driver(const char *name)
 {

@@ -49,10 +49,15 @@ enum key_type {
 };
 
 /* Drivers a key of a device belongs to. */
-#define KEY_LMS2XX 1u
-#define KEY_MODBUS 2u
-#define KEY_POSE   4u
-#define KEY_ALL    7u
+#define KEY_LMS2XX  1u
+#define KEY_MODBUS  2u
+#define KEY_POSE    4u
+#define KEY_TIM     8u
+#define KEY_LMS1XX  16u
+#define KEY_LMS5XX  32u
+#define KEY_COLA    (KEY_TIM | KEY_LMS1XX | KEY_LMS5XX)
+#define KEY_SCANNER (KEY_LMS2XX | KEY_COLA)
+#define KEY_ALL     63u
 
 struct key {
 	enum key_group group;

@@ -13,9 +13,11 @@
 #include <sys/types.h>
 
 #include "config/config.h"
+#include "core/state.h"
 #include "core/types.h"
 
-enum direction { FROM_DEVICE, TO_DEVICE };
+/* LINK_OPENED carries no bytes: the link was opened (anew), and what was begun before is lost. */
+enum direction { FROM_DEVICE, TO_DEVICE, LINK_OPENED };
 
 /* What the loop hands to a decoder, in the order in which it does (law L7). */
 struct record {
@@ -56,12 +58,26 @@ struct decoder_counters {
 	} counter[DECODER_COUNTERS_MAX];
 };
 
+/* How well a device keeps time: for the status. */
+struct decoder_timing {
+	bool known;            /* anything below is */
+	double expected_hz;    /* profiles (angles, poses) a second by what the device says; 0: not known */
+	int64_t jitter_p50_ns; /* how far arrivals are behind the least delayed ones, over the last thousand */
+	int64_t jitter_p99_ns;
+	uint64_t lost;     /* profiles that the device measured and nobody received, by its own counters */
+	bool stamps;       /* it stamps (or counts): the two below hold */
+	int64_t offset_ns; /* log time - device time, now */
+	double drift_ppm;  /* of the device's clock against the host's: positive runs fast */
+};
+
 enum device_role { ROLE_LASER, ROLE_TILT, ROLE_POSE };
+
+#define DIALOGUE_WRITE_MAX 256
 
 /* What a dialogue wants done now. */
 struct dialogue_step {
 	size_t write_len; /* bytes to write now (recorded as TO_DEVICE when written) */
-	uint8_t write[64];
+	uint8_t write[DIALOGUE_WRITE_MAX];
 	uint32_t baud;       /* 0, or: set the line to this rate now, after what was written has drained */
 	bool flush;          /* discard what the line holds */
 	int64_t deadline_ns; /* call again at the latest then; INT64_MAX: only on a reply */
@@ -81,6 +97,10 @@ struct driver {
 	void (*decoder_destroy)(struct decoder *);
 	void (*decode)(struct decoder *, const struct record *, const struct record_sink *);
 	void (*counters)(const struct decoder *, struct decoder_counters *ret);
+	void (*timing)(const struct decoder *, struct decoder_timing *ret); /* may be NULL */
+	/* Snapshot of all that decoding goes on from, clock filter included (core/state.h). A load that failed leaves the
+	 * decoder as new. */
+	void (*state)(struct decoder *, struct state *);
 	/* The wall clock was set: it is now `ahead_ns` ahead of the times of records. NULL: it matters not. */
 	void (*clock)(struct decoder *, int64_t ahead_ns);
 

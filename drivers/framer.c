@@ -8,9 +8,10 @@
 #include <assert.h>
 #include <string.h>
 
-void framer_init(struct framer *f, framer_scan *scan, void *ctx)
+void framer_init(struct framer *f, framer_scan *scan, void *ctx, uint8_t *buf, size_t cap)
 {
-	*f = (struct framer){.scan = scan, .ctx = ctx, .boundary = true};
+	assert(buf != NULL && cap > 0);
+	*f = (struct framer){.scan = scan, .ctx = ctx, .boundary = true, .buf = buf, .cap = cap};
 }
 
 size_t framer_push(struct framer *f, const uint8_t *bytes, size_t len)
@@ -21,7 +22,7 @@ size_t framer_push(struct framer *f, const uint8_t *bytes, size_t len)
 		f->silence -= f->silence < f->begin ? f->silence : f->begin;
 		f->begin = 0;
 	}
-	const size_t room = sizeof f->buf - f->end;
+	const size_t room = f->cap - f->end;
 	const size_t n = len < room ? len : room;
 	if (n > 0)
 		memcpy(f->buf + f->end, bytes, n);
@@ -51,7 +52,7 @@ size_t framer_take(struct framer *f, const uint8_t **ret_telegram)
 			f->boundary = true;
 			return (size_t)r;
 		}
-		const bool hopeless = f->begin < f->silence || len == sizeof f->buf;
+		const bool hopeless = f->begin < f->silence || len == f->cap;
 		if (r == FRAMER_MORE && !hopeless)
 			return 0;
 		framer_refuse(f, r == FRAMER_MORE ? FRAMER_CUT : -r);
@@ -64,4 +65,27 @@ void framer_silence(struct framer *f)
 	f->silence = f->end;
 	if (f->begin == f->end)
 		f->boundary = true;
+}
+
+void framer_restart(struct framer *f)
+{
+	if (f->begin < f->end) {
+		f->refused[FRAMER_CUT]++;
+		f->skipped += f->end - f->begin;
+	}
+	f->begin = f->end = f->silence = 0;
+	f->boundary = true;
+}
+
+void framer_state(struct state *s, struct framer *f)
+{
+	state_tag(s, "framer1");
+	for (int i = 0; i < FRAMER_REASONS; i++)
+		state_u64(s, &f->refused[i]);
+	state_u64(s, &f->skipped);
+	state_size(s, &f->end, f->cap);
+	state_size(s, &f->begin, f->end);
+	state_size(s, &f->silence, f->end);
+	state_bool(s, &f->boundary);
+	state_bytes(s, f->buf, s->failed ? 0 : f->end);
 }

@@ -4,7 +4,7 @@
  *                           ^ scan looks here: a length, "need more", or "not here, because"
  *
  * A false start costs one byte, so a good telegram is found wherever it begins, also inside a broken one. Memory is the
- * fixed buffer; what is longer than it is refused. Pure: silence is told by the caller, who knows the times. */
+ * caller's buffer; what is longer than it is refused. Pure: silence is told by the caller, who knows the times. */
 #ifndef FACET_DRIVERS_FRAMER_H
 #define FACET_DRIVERS_FRAMER_H
 
@@ -12,7 +12,7 @@
 #include <stddef.h>
 #include <stdint.h>
 
-#define FRAMER_CAPACITY 4096 /* bytes; no protocol may wait for a longer telegram */
+#include "core/state.h"
 
 /* Answers of a scan. Reasons of refusal are the protocol's own, from FRAMER_OWN on. */
 enum framer_reason {
@@ -36,10 +36,12 @@ struct framer {
 	size_t begin, end;                /* what of buf is not yet judged */
 	size_t silence;                   /* end of what came before the last silence, 0: none is left of it */
 	bool boundary;
-	uint8_t buf[FRAMER_CAPACITY];
+	uint8_t *buf; /* borrowed */
+	size_t cap;
 };
 
-void framer_init(struct framer *, framer_scan *, void *ctx);
+/* `buf`: `cap` bytes that live as long as the framer; no telegram may be longer. */
+void framer_init(struct framer *, framer_scan *, void *ctx, uint8_t *buf, size_t cap);
 
 /* Takes bytes, as many as there is room for; after framer_take has answered 0 there is room for at least one. */
 size_t framer_push(struct framer *, const uint8_t *bytes, size_t len);
@@ -51,5 +53,11 @@ size_t framer_take(struct framer *, const uint8_t **ret_telegram);
  * the next push makes it whole (it was the host that slept, and the line kept the rest), else it is refused, so that what
  * stands behind it is not held up; the silence is a boundary, too. */
 void framer_silence(struct framer *);
+
+/* The link was opened anew: what was begun is refused, whatever comes next stands at a boundary. Counters stay. */
+void framer_restart(struct framer *);
+
+/* Snapshot (core/state.h); scan, ctx and buffer stay the framer's own. */
+void framer_state(struct state *, struct framer *);
 
 #endif

@@ -19,6 +19,8 @@
 #include "drivers/clock_filter.h"
 #include "drivers/lms2xx_wire.h"
 
+#define LINE_BYTES 4096 /* more than the longest telegram */
+
 enum counter {
 	TELEGRAMS,
 	PROFILES,
@@ -57,6 +59,7 @@ struct decoder {
 	struct clock_filter clock;
 	int64_t heard_ns[2]; /* last bytes of a direction */
 	struct framer framer[2];
+	uint8_t bytes[2][LINE_BYTES];
 	uint64_t count[COUNTERS];
 	struct profile profile;
 };
@@ -69,8 +72,8 @@ struct decoder *lms2xx_decoder_create(const struct config_device *config, int de
 	d->device = device;
 	d->baud = config->baud;
 	clock_filter_init(&d->clock, LMS2XX_TURN_NS);
-	framer_init(&d->framer[FROM_DEVICE], lms2xx_scan_device, NULL);
-	framer_init(&d->framer[TO_DEVICE], lms2xx_scan_host, NULL);
+	framer_init(&d->framer[FROM_DEVICE], lms2xx_scan_device, NULL, d->bytes[FROM_DEVICE], LINE_BYTES);
+	framer_init(&d->framer[TO_DEVICE], lms2xx_scan_host, NULL, d->bytes[TO_DEVICE], LINE_BYTES);
 	return d;
 }
 
@@ -347,6 +350,11 @@ void lms2xx_decode(struct decoder *d, const struct record *record, const struct 
 {
 	const enum direction direction = record->direction == TO_DEVICE ? TO_DEVICE : FROM_DEVICE;
 	struct framer *framer = &d->framer[direction];
+	if (record->direction == LINK_OPENED) {
+		framer_restart(&d->framer[FROM_DEVICE]);
+		framer_restart(&d->framer[TO_DEVICE]);
+		return;
+	}
 	if (record->t_ns - d->heard_ns[direction] > LMS2XX_STALE_NS)
 		framer_silence(framer);
 	d->heard_ns[direction] = record->t_ns;

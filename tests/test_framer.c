@@ -9,6 +9,9 @@
 
 #include "drivers/framer.h"
 
+#define LINE_BYTES 4096
+static uint8_t line[LINE_BYTES];
+
 enum { BAD_SUM = FRAMER_OWN };
 
 /* A toy protocol: '<', length, that many bytes, their sum. '!' stands alone, at a boundary only. */
@@ -62,7 +65,7 @@ static void telegrams_come_out_the_same_however_they_are_cut(void **state)
 	char out[64];
 	for (size_t piece = 1; piece < sizeof bytes; piece++) {
 		struct framer f;
-		framer_init(&f, scan_toy, NULL);
+		framer_init(&f, scan_toy, NULL, line, sizeof line);
 		collect(&f, bytes, sizeof bytes - 1, piece, out);
 		assert_string_equal(out, "<\1aa|!|<\2ab\303|!|");
 		assert_int_equal(f.skipped, 0);
@@ -74,7 +77,7 @@ static void garbage_costs_a_byte_each_and_is_counted(void **state)
 	(void)state;
 	struct framer f;
 	char out[64];
-	framer_init(&f, scan_toy, NULL);
+	framer_init(&f, scan_toy, NULL, line, sizeof line);
 	collect(&f, (const uint8_t *)"xyz<\1aa", 7, 7, out);
 	assert_string_equal(out, "<\1aa|");
 	assert_int_equal(f.skipped, 3);
@@ -86,7 +89,7 @@ static void a_telegram_inside_a_false_start_is_found(void **state)
 	(void)state;
 	struct framer f;
 	char out[64];
-	framer_init(&f, scan_toy, NULL);
+	framer_init(&f, scan_toy, NULL, line, sizeof line);
 	collect(&f, (const uint8_t *)"<\4<\1aa<\1bb", 10, 10, out);
 	assert_string_equal(out, "<\1aa|<\1bb|");
 	assert_int_equal(f.refused[BAD_SUM], 1);
@@ -98,7 +101,7 @@ static void a_bare_byte_counts_at_a_boundary_only(void **state)
 	(void)state;
 	struct framer f;
 	char out[64];
-	framer_init(&f, scan_toy, NULL);
+	framer_init(&f, scan_toy, NULL, line, sizeof line);
 	collect(&f, (const uint8_t *)"x!<\1!!!", 7, 7, out);
 	assert_string_equal(out, "<\1!!|!|");
 	assert_int_equal(f.skipped, 2);
@@ -109,7 +112,7 @@ static void silence_ends_what_was_begun_and_is_a_boundary(void **state)
 	(void)state;
 	struct framer f;
 	char out[64];
-	framer_init(&f, scan_toy, NULL);
+	framer_init(&f, scan_toy, NULL, line, sizeof line);
 	collect(&f, (const uint8_t *)"<\11<\1aa", 6, 6, out);
 	assert_string_equal(out, "");
 	framer_silence(&f);
@@ -130,7 +133,7 @@ static void a_telegram_that_the_host_slept_in_is_taken(void **state)
 	char out[64];
 	for (size_t cut = 1; cut < 6; cut++) {
 		struct framer f;
-		framer_init(&f, scan_toy, NULL);
+		framer_init(&f, scan_toy, NULL, line, sizeof line);
 		collect(&f, (const uint8_t *)"!<\2ab\303", cut, cut, out);
 		framer_silence(&f);
 		collect(&f, (const uint8_t *)"!<\2ab\303" + cut, 6 - cut, 6, out);
@@ -147,8 +150,8 @@ static void a_scan_that_never_has_enough_does_not_fill_memory(void **state)
 	(void)state;
 	struct framer f;
 	const uint8_t *telegram;
-	static const uint8_t zeros[3 * FRAMER_CAPACITY];
-	framer_init(&f, scan_greedy, NULL);
+	static const uint8_t zeros[3 * LINE_BYTES];
+	framer_init(&f, scan_greedy, NULL, line, sizeof line);
 	for (size_t i = 0; i < sizeof zeros;) {
 		const size_t n = framer_push(&f, zeros + i, sizeof zeros - i);
 		assert_true(n > 0);
@@ -156,7 +159,7 @@ static void a_scan_that_never_has_enough_does_not_fill_memory(void **state)
 		assert_int_equal(framer_take(&f, &telegram), 0);
 	}
 	assert_int_equal(f.skipped, f.refused[FRAMER_CUT]);
-	assert_int_equal(f.skipped, 2 * FRAMER_CAPACITY + 1);
+	assert_int_equal(f.skipped, 2 * LINE_BYTES + 1);
 }
 
 int main(void)

@@ -52,6 +52,7 @@ struct sim_lms2xx {
 	uint8_t config[LMS2XX_CONFIG_MAX];
 	uint8_t scan_index, telegram_index, part;
 	struct framer framer;
+	uint8_t heard[4096];
 	int64_t heard_ns;
 
 	/* the mirror */
@@ -334,7 +335,7 @@ static void power_up(struct sim_lms2xx *sim)
 	sim->ready_ns = 0;
 	sim->len = sim->sent = 0;
 	sim->wire_end_ns = 0;
-	framer_init(&sim->framer, lms2xx_scan_host, NULL);
+	framer_init(&sim->framer, lms2xx_scan_host, NULL, sim->heard, sizeof sim->heard);
 }
 
 static void begin_stream(struct sim_lms2xx *sim, uint8_t mode)

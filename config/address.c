@@ -111,6 +111,23 @@ int address_parse_host(const char *text, struct address *ret, char error[ADDRESS
 	return status;
 }
 
+int address_parse_number(const char *text, uint16_t port, struct address *ret, char error[ADDRESS_ERROR_MAX])
+{
+	struct address address = {.kind = ADDRESS_TCP};
+	struct sockaddr_storage storage;
+	socklen_t len;
+	const int status = parse_host(text, port, &address, error);
+	if (status)
+		return status;
+	if (address_sockaddr(&address, &storage, &len))
+		return refuse(error, "'%.60s' is no address; names are not looked up, write a number like 192.168.0.1",
+		              address.host);
+	if (address.port == 0)
+		return refuse(error, "'%.60s': nobody listens on port 0", text);
+	*ret = address;
+	return 0;
+}
+
 int address_check_loopback(const struct address *address, char error[ADDRESS_ERROR_MAX])
 {
 	struct in_addr v4;

@@ -27,6 +27,10 @@ int address_parse(const char *text, unsigned kinds, struct address *ret, char er
 /* HOST:PORT or [HOST]:PORT without a word before it; the port is needed. The kind is ADDRESS_TCP. */
 int address_parse_host(const char *text, struct address *ret, char error[ADDRESS_ERROR_MAX]);
 
+/* HOST or HOST:PORT, HOST a number or `localhost`: nobody asks a name server while devices run. `port`: where none is
+ * written. The kind is ADDRESS_TCP. */
+int address_parse_number(const char *text, uint16_t port, struct address *ret, char error[ADDRESS_ERROR_MAX]);
+
 /* 0 where nobody from outside gets in: unix, 127.0.0.0/8, ::1, localhost; else -EINVAL with one sentence. */
 int address_check_loopback(const struct address *, char error[ADDRESS_ERROR_MAX]);
 

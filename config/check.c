@@ -42,7 +42,7 @@ static const struct config_device *find_device(const struct config *config, cons
 
 static bool is_tilt(const struct config_device *device)
 {
-	return keys_driver(device->driver) == KEY_MODBUS;
+	return keys_driver(device->driver) == KEY_MODBUS || device->encoder.set;
 }
 
 /* The name of the first device that tilts, for messages. */
@@ -67,17 +67,90 @@ static int check_tilt_name(struct reader *r, const struct config *config, const 
 	return 0;
 }
 
+/* The port where a scanner with CoLa listens (COLA_PORT of its driver). */
+#define SCANNER_PORT 2112
+
+static bool is_cola(const struct config_device *device)
+{
+	return keys_driver(device->driver) & KEY_COLA;
+}
+
+static bool is_usb(const struct config_device *device)
+{
+	return is_cola(device) && strncmp(device->connect, "usb", 3) == 0;
+}
+
+/* Two ways to write one address are one line. */
+static bool is_same_line(const struct config_device *a, const struct config_device *b)
+{
+	const char *mine = a->port[0] ? a->port : a->connect, *theirs = b->port[0] ? b->port : b->connect;
+	struct address one, other;
+	char sentence[ADDRESS_ERROR_MAX];
+	if (mine[0] && strcmp(mine, theirs) == 0)
+		return true;
+	return is_cola(a) && is_cola(b) && !address_parse_number(mine, SCANNER_PORT, &one, sentence) &&
+	       !address_parse_number(theirs, SCANNER_PORT, &other, sentence) && strcmp(one.host, other.host) == 0 &&
+	       one.port == other.port;
+}
+
 static int check_line_shared(struct reader *r, const struct config *config, int i)
 {
 	const struct config_device *device = &config->device[i];
+	const char *key = device->port[0] ? "port" : "connect";
 	for (int j = 0; j < i; j++) {
 		const struct config_device *other = &config->device[j];
-		const char *mine = device->port[0] ? device->port : device->connect;
-		const char *theirs = other->port[0] ? other->port : other->connect;
-		if (mine[0] && strcmp(mine, theirs) == 0)
-			return reader_fail(r, device_line(r, i, device->port[0] ? "port" : "connect"),
-			                   "devices[%d]: '%s' is already the line of '%s'", i, mine, other->name);
+		const bool any = strcmp(device->connect, "usb") == 0 || strcmp(other->connect, "usb") == 0;
+		if (is_usb(device) && is_usb(other) && any)
+			return reader_fail(r, device_line(r, i, key),
+			                   "devices[%d].connect: with two scanners on USB `usb` says too little; write "
+			                   "usb:SERIAL or usb:BUS-PORT at both ('%s' is the other)",
+			                   i, other->name);
+		if (is_same_line(device, other))
+			return reader_fail(r, device_line(r, i, key), "devices[%d]: '%s' is already the line of '%s'",
+			                   i, device->port[0] ? device->port : device->connect, other->name);
 	}
+	return 0;
+}
+
+/* BUS-PORT as the kernel names it, 1-1.2, or a serial number. */
+static bool is_usb_place(const char *text)
+{
+	size_t n = strspn(text, "0123456789");
+	if (n && text[n] == '-') {
+		do {
+			const size_t digits = strspn(text + n + 1, "0123456789");
+			if (!digits)
+				return false;
+			n += 1 + digits;
+		} while (text[n] == '.');
+		return !text[n];
+	}
+	for (n = 0; isalnum((unsigned char)text[n]) && (unsigned char)text[n] < 128;)
+		n++;
+	return n && n <= 32 && !text[n];
+}
+
+static int check_cola(struct reader *r, const struct config_device *device, int i)
+{
+	const int line = device_line(r, i, "connect");
+	char shown[READER_SHOWN_MAX], sentence[ADDRESS_ERROR_MAX];
+	struct address address;
+	if (is_usb(device)) {
+		if (keys_driver(device->driver) != KEY_TIM)
+			return reader_fail(r, line,
+			                   "devices[%d].connect: only a tim measures over USB; write HOST[:PORT]", i);
+		if (device->connect[3] && (device->connect[3] != ':' || !is_usb_place(device->connect + 4)))
+			return reader_fail(
+			    r, line,
+			    "devices[%d].connect: '%s' is not usb, usb:SERIAL or usb:BUS-PORT (like usb:1-1.2)", i,
+			    reader_shown(device->connect, shown));
+		return 0;
+	}
+	if (device->connect[0] == '/')
+		return reader_fail(r, line, "devices[%d].connect: a %s has no serial line here; write %sHOST[:PORT]", i,
+		                   device->driver, keys_driver(device->driver) == KEY_TIM ? "usb or " : "");
+	if (address_parse_number(device->connect, SCANNER_PORT, &address, sentence))
+		return reader_fail(r, line, "devices[%d].connect: %s", i, sentence);
 	return 0;
 }
 
@@ -136,6 +209,8 @@ static int check_device(struct reader *r, const struct config *config, int i)
 		error = check_tilt_name(r, config, key, device->tilt, device_line(r, i, "tilt"));
 	if (!error && keys_driver(device->driver) == KEY_MODBUS)
 		error = check_modbus(r, device, i);
+	if (!error && is_cola(device))
+		error = check_cola(r, device, i);
 	if (!error && keys_driver(device->driver) == KEY_POSE)
 		error = check_pose(r, config, i);
 	return error;

@@ -48,8 +48,8 @@ struct config_device {
 
 	enum { INDICES_KEEP, INDICES_ON } indices; /* lms2xx: real-time indices; setting them writes its memory */
 
-	/* every scanner */
-	int64_t latency_ns; /* how much earlier a profile was measured than its time says: calibrated, may be negative */
+	/* every scanner: how much earlier a profile was measured than its time says; calibrated, may be negative */
+	int64_t latency_ns;
 
 	/* tim, lms1xx, lms5xx; 0: as the device is set */
 	enum { PROTOCOL_AUTO, PROTOCOL_COLA_A, PROTOCOL_COLA_B } protocol;
@@ -64,14 +64,14 @@ struct config_device {
 		double zero;  /* ticks */
 		int sign;
 		double wrap; /* ticks after which they count from 0 again; 0: 2^32 */
-	} encoder; /* in the telegrams; the device may then be its own `tilt` */
+	} encoder;           /* in the telegrams; the device may then be its own `tilt` */
 
 	/* modbus: path of a serial line (RTU) or HOST:PORT (TCP). Scanners: HOST[:PORT], usb, usb:SERIAL, usb:BUS-PORT */
 	char connect[CONFIG_TEXT_MAX];
-	char parity;                   /* N, E, O */
-	int slave;                     /* `unit` of a Modbus device, 1..247 */
-	int64_t period_ns;             /* between polls; 0: as fast as the answers come */
-	int address_base;              /* 0 or 1 */
+	char parity;       /* N, E, O */
+	int slave;         /* `unit` of a Modbus device, 1..247 */
+	int64_t period_ns; /* between polls; 0: as fast as the answers come */
+	int address_base;  /* 0 or 1 */
 	struct config_register position, target, speed;
 	struct {
 		uint16_t address;

@@ -21,7 +21,7 @@ const struct key key_table[] = {
 	{GROUP_TOP, "map", KEY_GROUP, .inner = GROUP_MAP, .help = "The map: a signed distance in every voxel near a surface, turned into triangles."},
 	{GROUP_TOP, "robot", KEY_GROUP, .inner = GROUP_ROBOT, .help = "The robot's own body and what it can climb."},
 	{GROUP_TOP, "mount", KEY_GROUP, .inner = GROUP_MOUNT, .help = "Where the scanner sits: map <- base <- tilt axis <- laser, x forward, y left, z up. The lever arm from the axis to the mirror's centre matters: without it walls become double."},
-	{GROUP_TOP, "devices", KEY_DEVICES, .inner = GROUP_DEVICE, .help = "What is plugged in; at most 16. Every device has a name and a driver: lms2xx (SICK LMS200, 211, 220, 221, 291), modbus (a servo that tilts the scanner), pose (the robot's localisation)."},
+	{GROUP_TOP, "devices", KEY_DEVICES, .inner = GROUP_DEVICE, .help = "What is plugged in; at most 16. Every device has a name and a driver: lms2xx (SICK LMS200, 211, 220, 221, 291), tim (SICK TiM3xx, 5xx, 7xx), lms1xx, lms5xx, modbus (a servo that tilts the scanner), pose (the robot's localisation)."},
 	{GROUP_TOP, "sweep", KEY_GROUP, .inner = GROUP_SWEEP, .flag = offsetof(struct config, sweep.set), .help = "How the servo is commanded. Without this section it is only listened to."},
 	{GROUP_TOP, "listen", KEY_GROUP, .inner = GROUP_LISTEN, .help = "Where clients connect."},
 	{GROUP_TOP, "record", KEY_GROUP, .inner = GROUP_RECORD, .help = "Recordings of what the devices sent."},
@@ -50,16 +50,34 @@ const struct key key_table[] = {
 	{GROUP_FRAME, "rpy", KEY_VECTOR, .preset = "[0, 0, 0]", .dimension = DIMENSION_ANGLE, .min = DEG(-360), .max = DEG(360), .offset = sizeof(struct vec3), .size = sizeof(struct vec3), .help = "Roll, pitch, yaw about the fixed axes x, y, z."},
 
 	{GROUP_DEVICE, "name", KEY_TEXT, KEY_ALL, .required = true, DEVICE(name), .help = "What messages, `tilt` and `sweep.device` call it: letters, digits, - and _."},
-	{GROUP_DEVICE, "driver", KEY_TEXT, KEY_ALL, .required = true, .choices = "lms2xx|modbus|pose", DEVICE(driver), .help = "What it is."},
+	{GROUP_DEVICE, "driver", KEY_TEXT, KEY_ALL, .required = true, .choices = "lms2xx|modbus|pose|tim|lms1xx|lms5xx", DEVICE(driver), .help = "What it is."},
 
 	{GROUP_DEVICE, "port", KEY_TEXT, KEY_LMS2XX, .required = true, .example = "/dev/ttyUSB0", DEVICE(port), .help = "Serial line. A name under /dev/serial/by-id/ stays the same over reboots."},
 	{GROUP_DEVICE, "baud", KEY_INTEGER, KEY_LMS2XX, .preset = "38400", .example = "500000", .choices = "9600|19200|38400|500000", DEVICE(baud), .help = "Rate to stream at; the rate the scanner has now is found. 500000 needs RS-422."},
 	{GROUP_DEVICE, "variant", KEY_VARIANT, KEY_LMS2XX, .preset = "180/0.5", .choices = "180/1|180/0.5|180/0.25|100/1|100/0.5|100/0.25", .help = "Field of view / resolution in degrees. 180/0.25 is made of partial scans."},
 	{GROUP_DEVICE, "unit", KEY_CHOICE, KEY_LMS2XX, .preset = "keep", .choices = "keep|mm|cm", DEVICE(range_unit), .help = "Unit of its ranges; keep: as the scanner is set. Changing it writes its memory, which wears."},
 	{GROUP_DEVICE, "mode", KEY_INTEGER, KEY_LMS2XX, .preset = "keep", .word = "keep", .word_value = -1, .choices = "0|1|2|3|4|5|6|15", DEVICE(mode), .help = "Measuring mode: how many bits are range (0-2: 13, 3-4: 14, 5-6: 15, 15: 16)."},
+	{GROUP_DEVICE, "indices", KEY_CHOICE, KEY_LMS2XX, .preset = "keep", .choices = "keep|on", DEVICE(indices), .help = "Real-time indices: a count of turns in every profile, the steadiest time base there is; keep: as the scanner is set. Changing it writes its memory, which wears."},
+
+	{GROUP_DEVICE, "connect", KEY_TEXT, KEY_TIM, .required = true, .example = "usb", DEVICE(connect), .help = "usb; usb:SERIAL or usb:BUS-PORT (like usb:1-1.2) where there are several, `facet devices` lists them; or HOST[:PORT], HOST a number, port 2112 where none is written."},
+	{GROUP_DEVICE, "connect", KEY_TEXT, KEY_LMS1XX, .required = true, .example = "192.168.0.1", DEVICE(connect), .help = "HOST[:PORT], HOST a number, port 2112 where none is written."},
+	{GROUP_DEVICE, "connect", KEY_TEXT, KEY_LMS5XX, .required = true, .example = "\"192.168.0.2:2112\"", DEVICE(connect), .help = "HOST[:PORT], HOST a number, port 2112 where none is written."},
+	{GROUP_DEVICE, "protocol", KEY_CHOICE, KEY_COLA, .preset = "auto", .choices = "auto|a|b", DEVICE(protocol), .help = "CoLa dialect, text or binary; auto: found by trying."},
+	{GROUP_DEVICE, "frequency", KEY_REAL, KEY_COLA, .preset = "keep", .word = "keep", .word_value = 0, .dimension = DIMENSION_FREQUENCY, .min = 1, .max = 600, DEVICE(frequency_hz), .help = "Of the mirror; keep: as the scanner is set. Frequency and resolution go together: LMS1xx 25Hz with 0.25deg, 50Hz with 0.5deg; LMS5xx 25Hz with 0.1667deg or 0.25deg, 35Hz, 50Hz with 0.3333deg or 0.5deg, 75Hz, 100Hz with 0.6667deg or 1deg. Most TiM have one only."},
+	{GROUP_DEVICE, "resolution", KEY_REAL, KEY_COLA, .preset = "keep", .word = "keep", .word_value = 0, .dimension = DIMENSION_ANGLE, .min = DEG(0.01), .max = DEG(10), DEVICE(resolution_rad), .help = "Between two beams; keep: as the scanner is set."},
+	{GROUP_DEVICE, "angles", KEY_PAIR, KEY_COLA, .dimension = DIMENSION_ANGLE, .min = DEG(-180), .max = DEG(180), DEVICE(angles_from_rad), .help = "The part of the field of view that is sent, e.g. [-90deg, 90deg]: 0 is straight ahead, positive left. Left out: as the scanner is set."},
+	{GROUP_DEVICE, "every", KEY_INTEGER, KEY_COLA, .preset = "keep", .word = "keep", .word_value = 0, .min = 1, .max = 1000, DEVICE(every), .help = "Every n-th scan is sent; keep: as the scanner is set."},
+	{GROUP_DEVICE, "remission", KEY_CHOICE, KEY_COLA, .preset = "keep", .choices = "keep|off|8|16", DEVICE(remission), .help = "Bits of remission sent with every beam; keep: as the scanner is set."},
+	{GROUP_DEVICE, "stamp", KEY_CHOICE, KEY_COLA, .preset = "auto", .choices = "auto|start|end", DEVICE(stamp), .help = "What the scanner's time stamp marks: the start or the end of a scan; auto: by the model."},
+	{GROUP_DEVICE, "encoder", KEY_GROUP, KEY_LMS1XX | KEY_LMS5XX, .example = "{scale: 0.01deg, zero: 0, sign: 1}", .inner = GROUP_ENCODER, .flag = offsetof(struct config_device, encoder.set), .help = "An incremental encoder on the scanner's own inputs, whose ticks come with every profile: angle = sign * scale * (ticks - zero). Name this device as `tilt`, its own or another scanner's."},
+
+	{GROUP_DEVICE, "latency", KEY_DURATION, KEY_SCANNER, .preset = "0", .dimension = DIMENSION_TIME, .min = -1, .max = 1, DEVICE(latency_ns), .help = "How much earlier a profile was measured than its time says; calibrated, may be negative."},
 	{GROUP_DEVICE, "range", KEY_PAIR, KEY_LMS2XX, .preset = "[0.05, 82]", .example = "[0.3, 30]", .dimension = DIMENSION_LENGTH, .min = 0, .max = 100, DEVICE(range_min_m), .help = "Beams outside are dropped and clear nothing."},
-	{GROUP_DEVICE, "mask", KEY_MASKS, KEY_LMS2XX, .preset = "[]", .dimension = DIMENSION_ANGLE, .min = DEG(-180), .max = DEG(180), .help = "Bearings left out, e.g. [[-90deg, -80deg]]: 0 is straight ahead, positive left."},
-	{GROUP_DEVICE, "tilt", KEY_TILT, KEY_LMS2XX, .preset = "0deg", .example = "servo", .dimension = DIMENSION_ANGLE, .min = DEG(-180), .max = DEG(180), .help = "The device that tilts this one, or the fixed angle at which it is mounted."},
+	{GROUP_DEVICE, "range", KEY_PAIR, KEY_TIM, .preset = "[0.05, 25]", .dimension = DIMENSION_LENGTH, .min = 0, .max = 100, DEVICE(range_min_m), .help = "Beams outside are dropped and clear nothing."},
+	{GROUP_DEVICE, "range", KEY_PAIR, KEY_LMS1XX, .preset = "[0.05, 50]", .dimension = DIMENSION_LENGTH, .min = 0, .max = 100, DEVICE(range_min_m), .help = "Beams outside are dropped and clear nothing."},
+	{GROUP_DEVICE, "range", KEY_PAIR, KEY_LMS5XX, .preset = "[0.05, 82]", .dimension = DIMENSION_LENGTH, .min = 0, .max = 100, DEVICE(range_min_m), .help = "Beams outside are dropped and clear nothing."},
+	{GROUP_DEVICE, "mask", KEY_MASKS, KEY_SCANNER, .preset = "[]", .dimension = DIMENSION_ANGLE, .min = DEG(-180), .max = DEG(180), .help = "Bearings left out, e.g. [[-90deg, -80deg]]: 0 is straight ahead, positive left."},
+	{GROUP_DEVICE, "tilt", KEY_TILT, KEY_SCANNER, .preset = "0deg", .example = "servo", .dimension = DIMENSION_ANGLE, .min = DEG(-180), .max = DEG(180), .help = "The device that tilts this one, or the fixed angle at which it is mounted."},
 
 	{GROUP_DEVICE, "connect", KEY_TEXT, KEY_MODBUS, .required = true, .example = "/dev/ttyUSB1", DEVICE(connect), .help = "Serial line (RTU) or HOST:PORT (TCP)."},
 	{GROUP_DEVICE, "baud", KEY_INTEGER, KEY_MODBUS, .preset = "115200", .min = 1200, .max = 4000000, DEVICE(baud), .help = "Rate of the serial line."},
@@ -84,6 +102,11 @@ const struct key key_table[] = {
 	{GROUP_REGISTER, "sign", KEY_INTEGER, .preset = "1", .choices = "1|-1", REGISTER_(sign), .help = "-1 where the device counts up when the scanner looks up."},
 	{GROUP_WRITE, "address", KEY_INTEGER, .required = true, .min = 0, .max = 65535, .offset = 0, .size = 2, .help = "Register."},
 	{GROUP_WRITE, "value", KEY_INTEGER, .required = true, .min = 0, .max = 65535, .offset = 2, .size = 2, .help = "What is written there."},
+
+	{GROUP_ENCODER, "scale", KEY_REAL, .required = true, .dimension = DIMENSION_ANGLE, .min = DEG(1e-6), .max = DEG(360), DEVICE(encoder.scale), .help = "Angle of one tick, e.g. 0.01deg."},
+	{GROUP_ENCODER, "zero", KEY_REAL, .preset = "0", DEVICE(encoder.zero), .help = "Ticks at angle 0."},
+	{GROUP_ENCODER, "sign", KEY_INTEGER, .preset = "1", .choices = "1|-1", DEVICE(encoder.sign), .help = "-1 where the ticks count up when the scanner looks up."},
+	{GROUP_ENCODER, "wrap", KEY_REAL, .preset = "0", .min = 0, .max = 4294967296.0, DEVICE(encoder.wrap), .help = "Ticks after which the device counts from 0 again; 0: 32 bits."},
 
 	{GROUP_SWEEP, "device", KEY_TEXT, .required = true, .example = "servo", CONFIG(sweep.device), .help = "The servo."},
 	{GROUP_SWEEP, "from", KEY_REAL, .preset = "-65deg", .dimension = DIMENSION_ANGLE, .min = DEG(-180), .max = DEG(180), CONFIG(sweep.from_rad), .help = "Upper end; positive looks down."},
@@ -213,6 +236,6 @@ void keys_print_range(const struct key *key, char *ret, size_t cap)
 	} else if (key->min != 0 || key->max != 0) {
 		units_print(key->min, key->dimension, min, sizeof(min));
 		units_print(key->max, key->dimension, max, sizeof(max));
-		snprintf(ret, cap, "%s .. %s", min, max);
+		snprintf(ret, cap, "%s%s%s .. %s", key->word ? key->word : "", key->word ? " or " : "", min, max);
 	}
 }

@@ -60,10 +60,12 @@ static void describe(FILE *out, int indent, const struct key *key, const char *n
 	put_comment(out, indent, text);
 }
 
-static void put_key(FILE *out, int indent, const struct key *key)
+/* `brief`: what it means stands above already. */
+static void put_key(FILE *out, int indent, const struct key *key, bool brief)
 {
 	const char *value = key->example ? key->example : key->preset;
-	describe(out, indent, key, "");
+	if (!brief)
+		describe(out, indent, key, "");
 	put_indent(out, indent);
 	fprintf(out, "%s%s:%s%s\n", value ? "" : "# ", key->name, value && value[0] ? " " : "", value ? value : "");
 }
@@ -87,19 +89,34 @@ static void put_group(FILE *out, enum key_group group, bool *described)
 		if (key->group != group)
 			continue;
 		put_parts(out, 2, key, described);
-		put_key(out, 2, key);
+		put_key(out, 2, key, false);
 	}
+}
+
+/* Was this key described with a driver before this one, word by word? */
+static bool is_repeated(const struct key *key, unsigned driver)
+{
+	for (const struct key *other = key_table; other->name; other++)
+		if (other->group == GROUP_DEVICE && (other->drivers & (driver - 1)) &&
+		    strcmp(other->name, key->name) == 0 && strcmp(other->help, key->help) == 0)
+			return true;
+	return false;
 }
 
 static void put_device(FILE *out, unsigned driver, bool *described)
 {
-	const char *name = driver == KEY_LMS2XX ? "laser" : driver == KEY_MODBUS ? "servo" : "pose";
+	const char *name = driver == KEY_LMS2XX   ? "laser"
+	                   : driver == KEY_MODBUS ? "servo"
+	                   : driver == KEY_POSE   ? "pose"
+	                   : driver == KEY_TIM    ? "front"
+	                   : driver == KEY_LMS1XX ? "left"
+	                                          : "right";
 	fprintf(out, "\n  - name: %s\n    driver: %s\n", name, keys_driver_name(driver));
 	for (const struct key *key = key_table; key->name; key++) {
 		if (key->group != GROUP_DEVICE || key->drivers == KEY_ALL || !(key->drivers & driver))
 			continue;
 		put_parts(out, 4, key, described);
-		put_key(out, 4, key);
+		put_key(out, 4, key, is_repeated(key, driver));
 	}
 }
 
@@ -116,7 +133,7 @@ void keys_write_manual(FILE *out)
 		fprintf(out, "%s:\n", key->name);
 		if (key->type == KEY_GROUP)
 			put_group(out, key->inner, described);
-		for (unsigned driver = KEY_LMS2XX; key->type == KEY_DEVICES && driver <= KEY_POSE; driver <<= 1)
+		for (unsigned driver = KEY_LMS2XX; key->type == KEY_DEVICES && driver <= KEY_LMS5XX; driver <<= 1)
 			put_device(out, driver, described);
 	}
 }

@@ -406,11 +406,12 @@ static int read_device(struct reader *r, int at, struct config_device *device)
 {
 	const struct yaml_node *node = node_at(r, at);
 	const int driver = reader_child(r, at, "driver");
-	if (driver < 0)
-		return reader_fail(r, node->line, "%s: `driver` is missing; it is one of lms2xx, modbus, pose",
-		                   r->path);
-	int index;
 	const struct key *key = keys_find(GROUP_DEVICE, "driver", 0);
+	char range[120];
+	keys_print_range(key, range, sizeof(range));
+	if (driver < 0)
+		return reader_fail(r, node->line, "%s: `driver` is missing; it is %s", r->path, range);
+	int index;
 	const int error = read_choice(r, key, driver, &index);
 	if (error)
 		return error;
@@ -525,15 +526,25 @@ static int judge_later(struct reader *r, const struct key *key, int at)
 	                   key->preset[0] ? "the only value is " : "leave it empty", key->preset);
 }
 
+/* The drivers that have this key: "modbus, tim". False: none has. */
+static bool key_owners(const char *name, char *ret, size_t cap)
+{
+	size_t n = 0;
+	for (unsigned bit = 1; bit & KEY_ALL; bit <<= 1)
+		if (keys_find(GROUP_DEVICE, name, bit) && n < cap)
+			n += (size_t)snprintf(ret + n, cap - n, "%s%s", n ? ", " : "", keys_driver_name(bit));
+	return n > 0;
+}
+
 /* Names the key that was probably meant, or where a key of this name belongs. */
 static int unknown_key(struct reader *r, enum key_group group, unsigned drivers, const struct yaml_node *node)
 {
 	char shown[READER_SHOWN_MAX];
 	reader_shown(node->text, shown);
-	const struct key *other = group == GROUP_DEVICE ? keys_find(group, node->text, 0) : NULL;
-	if (other)
-		return reader_fail(r, node->line, "%s: '%s' is a key of the driver %s, not of %s", r->path, shown,
-		                   keys_driver_name(other->drivers), keys_driver_name(drivers));
+	char owners[80];
+	if (group == GROUP_DEVICE && key_owners(node->text, owners, sizeof(owners)))
+		return reader_fail(r, node->line, "%s: '%s' is a key of %s, not of %s", r->path, shown, owners,
+		                   keys_driver_name(drivers));
 	const struct key *nearest = keys_nearest(group, node->text, drivers);
 	return reader_fail(r, node->line, "unknown key '%s'%s%s; the nearest known one is '%s'", shown,
 	                   r->path[0] ? " in " : "", r->path, nearest->name);
@@ -604,7 +615,9 @@ int reader_group(struct reader *r, enum key_group group, unsigned drivers, int m
 	if (map < 0)
 		return 0;
 	if (yaml_is_null(node_at(r, map))) /* an empty section is none; an empty device or register is a mistake */
-		return group == GROUP_SWEEP || group == GROUP_BOX ? 0 : check_required(r, group, drivers, map);
+		return group == GROUP_SWEEP || group == GROUP_BOX || group == GROUP_ENCODER
+		           ? 0
+		           : check_required(r, group, drivers, map);
 	if (node_at(r, map)->kind != YAML_MAP)
 		return reader_fail(r, node_at(r, map)->line, "%s: `key: value` pairs are needed here",
 		                   r->path[0] ? r->path : "configuration");

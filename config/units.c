@@ -24,6 +24,7 @@ static const struct suffix suffixes[DIMENSIONS][10] = {
     [DIMENSION_ANGLE] = {{"deg", DEGREE}, {"rad", 1}, {"mrad", 0.001}, {"", 1}},
     [DIMENSION_TIME] = {{"h", 3600}, {"min", 60}, {"s", 1}, {"ms", 1e-3}, {"us", 1e-6}, {"ns", 1e-9}, {"", 1}},
     [DIMENSION_RATE] = {{"deg/s", DEGREE}, {"rad/s", 1}, {"deg", DEGREE}, {"rad", 1}, {"", 1}},
+    [DIMENSION_FREQUENCY] = {{"Hz", 1}, {"", 1}},
     [DIMENSION_BYTES] = {{"G", 1073741824.0}, {"M", 1048576.0}, {"k", 1024.0}, {"", 1}},
 };
 
@@ -31,6 +32,7 @@ static const char *const lists[DIMENSIONS] = {
     [DIMENSION_NONE] = "k, M, G",         [DIMENSION_LENGTH] = "m, cm, mm",
     [DIMENSION_ANGLE] = "deg, rad, mrad", [DIMENSION_TIME] = "h, min, s, ms, us, ns",
     [DIMENSION_RATE] = "deg/s, rad/s",    [DIMENSION_BYTES] = "k, M, G",
+    [DIMENSION_FREQUENCY] = "Hz",
 };
 
 static size_t digits(const char *text)

@@ -9,7 +9,8 @@ enum dimension {
 	DIMENSION_LENGTH,
 	DIMENSION_ANGLE,
 	DIMENSION_TIME,
-	DIMENSION_RATE,  /* rad/s; `30deg` is read as 30deg/s */
+	DIMENSION_RATE, /* rad/s; `30deg` is read as 30deg/s */
+	DIMENSION_FREQUENCY,
 	DIMENSION_BYTES, /* k, M, G are powers of 1024 */
 	DIMENSIONS
 };

@@ -160,7 +160,7 @@ static void an_unknown_key_names_its_line_and_the_nearest_key(void **state)
 	assert_refused("devices:\n- name: a\n  driver: lms2xx\n  prot: x\n",
 	               "f.yaml:4: unknown key 'prot' in devices[0]", "'port'");
 	assert_refused("devices:\n- {name: a, driver: lms2xx, port: x, connect: y}\n", "f.yaml:2: devices[0]",
-	               "key of the driver modbus, not of lms2xx");
+	               "a key of modbus, tim, lms1xx, lms5xx, not of lms2xx");
 }
 
 static void a_value_out_of_range_names_the_range(void **state)
@@ -242,7 +242,10 @@ static void every_driver_gets_what_it_needs(void **state)
 {
 	(void)state;
 	assert_refused("devices: [{name: a}]", "f.yaml:1: devices[0]", "`driver` is missing");
-	assert_refused("devices: [{name: a, driver: lms1xx}]", "f.yaml:1:", "one of lms2xx, modbus, pose");
+	assert_refused("devices: [{name: a, driver: lms9xx}]",
+	               "f.yaml:1:", "one of lms2xx, modbus, pose, tim, lms1xx, lms5xx");
+	assert_refused("devices: [{name: a}]", "f.yaml:1:", "one of lms2xx, modbus, pose, tim, lms1xx, lms5xx");
+	assert_refused("devices: [{name: a, driver: tim}]", "f.yaml:1: devices[0]", "`connect` is missing");
 	assert_refused("devices:\n- driver: lms2xx\n  name: a", "f.yaml:2: devices[0]", "`port` is missing");
 	assert_refused("devices: [{driver: pose, fixed: {}}]", "f.yaml:1:", "`name` is missing");
 	assert_refused("devices: [{name: a, driver: modbus, connect: /dev/x}]", "f.yaml:1:", "`position` is missing");
@@ -439,6 +442,186 @@ static void the_scanner_gets_its_mount_masks_and_pose(void **state)
 	assert_near(p.map_base.t.y, 2, 0);
 }
 
+static const char scanners[] =
+    "devices:\n"
+    "  - {name: front, driver: tim, connect: \"usb:1-1.2\", protocol: a, every: 2, remission: off, stamp: end,\n"
+    "     latency: -2ms, tilt: left, range: [0.1, 10], mask: [[-100deg, -90deg]]}\n"
+    "  - {name: left, driver: lms1xx, connect: 192.168.0.1, frequency: 25Hz, resolution: 0.25deg, remission: 16,\n"
+    "     angles: [-45deg, 90deg], encoder: {scale: 0.02deg, zero: 5, sign: -1, wrap: 16384}, tilt: left}\n"
+    "  - {name: right, driver: lms5xx, connect: \"192.168.0.1:2111\", protocol: b, remission: 8, stamp: start}\n"
+    "  - {name: old, driver: lms2xx, port: /dev/l, indices: on, latency: 1ms}\n";
+
+static void every_value_of_a_scanner_arrives(void **state)
+{
+	(void)state;
+	struct config c;
+	struct config_error error;
+	if (read_text(scanners, &c, &error))
+		fail_msg("%s", error.text);
+	const struct config_device *front = &c.device[0], *left = &c.device[1], *right = &c.device[2];
+	assert_string_equal(front->connect, "usb:1-1.2");
+	assert_int_equal(front->protocol, PROTOCOL_COLA_A);
+	assert_int_equal(front->every, 2);
+	assert_int_equal(front->remission, REMISSION_OFF);
+	assert_int_equal(front->stamp, STAMP_END);
+	assert_int_equal(front->latency_ns, -2000000);
+	assert_string_equal(front->tilt, "left");
+	assert_near(front->range_max_m, 10, 0);
+	assert_int_equal(front->masks, 1);
+	assert_false(front->encoder.set);
+	assert_near(left->frequency_hz, 25, 0);
+	assert_near(left->resolution_rad, 0.25 * DEG, 1e-12);
+	assert_near(left->angles_from_rad, -45 * DEG, 1e-12);
+	assert_near(left->angles_to_rad, 90 * DEG, 1e-12);
+	assert_int_equal(left->remission, REMISSION_16);
+	assert_true(left->encoder.set);
+	assert_near(left->encoder.scale, 0.02 * DEG, 1e-12);
+	assert_near(left->encoder.zero, 5, 0);
+	assert_int_equal(left->encoder.sign, -1);
+	assert_near(left->encoder.wrap, 16384, 0);
+	assert_int_equal(right->protocol, PROTOCOL_COLA_B);
+	assert_int_equal(right->remission, REMISSION_8);
+	assert_int_equal(right->stamp, STAMP_START);
+	assert_int_equal(c.device[3].indices, INDICES_ON);
+	assert_int_equal(c.device[3].latency_ns, 1000000);
+}
+
+static void a_scanner_that_is_only_plugged_in_keeps_its_own_settings(void **state)
+{
+	(void)state;
+	static const struct {
+		const char *driver;
+		double range_max_m;
+	} family[] = {{"tim", 25}, {"lms1xx", 50}, {"lms5xx", 82}};
+	for (size_t i = 0; i < sizeof(family) / sizeof(family[0]); i++) {
+		struct config c;
+		struct config_error error;
+		char text[200];
+		snprintf(text, sizeof(text), "devices: [{name: a, driver: %s, connect: 10.0.0.1, encoder: }]",
+		         family[i].driver);
+		if (i == 0)
+			snprintf(text, sizeof(text), "devices: [{name: a, driver: tim, connect: usb}]");
+		if (read_text(text, &c, &error))
+			fail_msg("%s", error.text);
+		const struct config_device *d = &c.device[0];
+		assert_true(d->frequency_hz == 0 && d->resolution_rad == 0 && d->every == 0);
+		assert_true(d->angles_from_rad == d->angles_to_rad && !d->encoder.set && d->latency_ns == 0);
+		assert_true(d->protocol == PROTOCOL_AUTO && d->remission == REMISSION_KEEP && d->stamp == STAMP_AUTO);
+		assert_near(d->range_max_m, family[i].range_max_m, 0);
+	}
+}
+
+static void a_scanner_is_connected_in_a_way_it_has(void **state)
+{
+	(void)state;
+	static const struct {
+		const char *driver, *connect, *sentence;
+	} bad[] = {
+	    {"tim", "''", "nothing is written"},
+	    {"tim", "usbb", "not usb, usb:SERIAL or usb:BUS-PORT"},
+	    {"tim", "'usb:'", "not usb, usb:SERIAL or usb:BUS-PORT"},
+	    {"tim", "'usb:1-'", "not usb, usb:SERIAL"},
+	    {"tim", "'usb:1-1.'", "not usb, usb:SERIAL"},
+	    {"tim", "'usb:1-1.2x'", "not usb, usb:SERIAL"},
+	    {"tim", "'usb:a b'", "not usb, usb:SERIAL"},
+	    {"tim", "'usb:123456789012345678901234567890123'", "not usb, usb:SERIAL"},
+	    {"lms1xx", "usb", "only a tim measures over USB; write HOST[:PORT]"},
+	    {"lms5xx", "'usb:1-1'", "only a tim measures over USB; write HOST[:PORT]"},
+	    {"tim", "/dev/ttyACM0", "no serial line here; write usb or HOST[:PORT]"},
+	    {"lms1xx", "/dev/ttyUSB0", "no serial line here; write HOST[:PORT]"},
+	    {"lms1xx", "scanner.local", "names are not looked up, write a number like 192.168.0.1"},
+	    {"lms1xx", "'10.0.0.1:x'", "is not a port"},
+	    {"lms1xx", "'10.0.0.1:0'", "nobody listens on port 0"},
+	    {"lms1xx", "'10.0.0.1:65536'", "is not a port"},
+	    {"lms1xx", "'[::1'", "the closing ]"},
+	};
+	char text[400];
+	for (size_t i = 0; i < sizeof(bad) / sizeof(bad[0]); i++) {
+		snprintf(text, sizeof(text), "devices:\n- {name: s, driver: %s, connect: %s}", bad[i].driver,
+		         bad[i].connect);
+		assert_refused(text, "f.yaml:2: devices[0].connect", bad[i].sentence);
+	}
+	static const char *const good[] = {"usb",       "'usb:16160456'", "'usb:1-1'", "'usb:12-3.4.1'",
+	                                   "localhost", "'[::1]:2111'"};
+	for (size_t i = 0; i < sizeof(good) / sizeof(good[0]); i++) {
+		struct config c;
+		struct config_error error;
+		snprintf(text, sizeof(text), "devices: [{name: s, driver: tim, connect: %s}]", good[i]);
+		if (read_text(text, &c, &error))
+			fail_msg("%s", error.text);
+	}
+}
+
+static void two_scanners_have_two_lines(void **state)
+{
+	(void)state;
+#define TWO(a, b) \
+	"devices:\n- {name: a, driver: tim, connect: \"" a "\"}\n- {name: b, driver: tim, connect: \"" b "\"}\n"
+	assert_refused(TWO("usb", "usb"), "f.yaml:3: devices[1].connect", "usb:SERIAL or usb:BUS-PORT at both");
+	assert_refused(TWO("usb:1-1", "usb"), "f.yaml:3: devices[1].connect", "('a' is the other)");
+	assert_refused(TWO("usb", "usb:1-1"), "f.yaml:3: devices[1].connect", "('a' is the other)");
+	assert_refused(TWO("usb:1-1", "usb:1-1"), "f.yaml:3:", "already the line of 'a'");
+	assert_refused(TWO("10.0.0.1", "10.0.0.1"), "f.yaml:3:", "already the line of 'a'");
+	assert_refused(TWO("10.0.0.1:2112", "10.0.0.1"), "f.yaml:3:", "already the line of 'a'");
+	struct config c;
+	struct config_error error;
+	assert_int_equal(read_text(TWO("usb:1-1", "usb:1-2"), &c, &error), 0);
+	assert_int_equal(read_text(TWO("usb", "10.0.0.1"), &c, &error), 0);
+	assert_int_equal(read_text(TWO("10.0.0.1:2111", "10.0.0.1"), &c, &error), 0);
+#undef TWO
+}
+
+static void only_who_has_an_encoder_or_a_servo_tilts(void **state)
+{
+	(void)state;
+	assert_refused("devices: [{name: a, driver: tim, connect: usb, encoder: {scale: 1deg}}]",
+	               "f.yaml:1: devices[0]", "'encoder' is a key of lms1xx, lms5xx, not of tim");
+	assert_refused("devices: [{name: a, driver: lms1xx, connect: 10.0.0.1, tilt: a}]", "f.yaml:1: devices[0].tilt",
+	               "tilts nothing");
+	assert_refused("devices: [{name: a, driver: lms1xx, connect: 10.0.0.1, encoder: {zero: 1}}]",
+	               "f.yaml:1:", "`scale` is missing");
+	assert_refused("devices: [{name: a, driver: lms1xx, connect: 10.0.0.1, encoder: {scale: 1deg, sign: 0}}]",
+	               "f.yaml:1: devices[0].encoder.sign", "one of 1, -1");
+	assert_refused("devices: [{name: a, driver: lms1xx, connect: 10.0.0.1, encoder: {scale: 0}}]",
+	               "f.yaml:1: devices[0].encoder.scale", "outside");
+	assert_refused("devices: [{name: a, driver: lms1xx, connect: 10.0.0.1, encoder: {scale: 1deg, wrap: -1}}]",
+	               "f.yaml:1: devices[0].encoder.wrap", "outside");
+	assert_refused("devices: [{name: a, driver: lms5xx, connect: 10.0.0.1, encoder: {scale: 1deg}}]\n"
+	               "sweep: {device: a}",
+	               "f.yaml:2: sweep.device", "no `target` register");
+}
+
+static void values_of_a_scanner_out_of_range_are_refused(void **state)
+{
+	(void)state;
+	static const struct {
+		const char *more, *sentence;
+	} bad[] = {
+	    {"protocol: c", "one of auto, a, b"},
+	    {"frequency: 0", "outside keep or 1Hz .. 600Hz"},
+	    {"frequency: 25deg", "use one of Hz"},
+	    {"resolution: 0.5", "outside keep or 0.01deg .. 10deg (a number without a unit is in radians"},
+	    {"angles: [45deg, -45deg]", "the first number must be smaller"},
+	    {"angles: [-200deg, 0]", "-180deg .. 180deg"},
+	    {"every: 0", "outside keep or 1 .. 1000"},
+	    {"every: 1.5", "not a whole number"},
+	    {"remission: 12", "one of keep, off, 8, 16"},
+	    {"stamp: middle", "one of auto, start, end"},
+	    {"latency: 2s", "-1s .. 1s"},
+	    {"latency: 5m", "use one of h, min, s"},
+	    {"range: [1, 200]", "0 .. 100m"},
+	    {"indices: on", "'indices' is a key of lms2xx, not of lms1xx"},
+	};
+	char text[400];
+	for (size_t i = 0; i < sizeof(bad) / sizeof(bad[0]); i++) {
+		snprintf(text, sizeof(text), "devices:\n- {name: s, driver: lms1xx, connect: 10.0.0.1, %s}",
+		         bad[i].more);
+		assert_refused(text, "f.yaml:2: devices[0]", bad[i].sentence);
+	}
+	assert_refused("devices: [{name: l, driver: lms2xx, port: /l, indices: off}]", "f.yaml:1:", "one of keep, on");
+	assert_refused("devices: [{name: l, driver: lms2xx, port: /l, latency: -1.5s}]", "f.yaml:1:", "-1s .. 1s");
+}
+
 static char *manual(size_t *len)
 {
 	char *text = NULL;
@@ -475,7 +658,7 @@ static void the_manual_is_a_configuration_and_names_every_key(void **state)
 	struct config_error error;
 	if (config_read(text, len, "config/facetd.yaml", &c, &error))
 		fail_msg("%s", error.text);
-	assert_int_equal(c.devices, 3);
+	assert_int_equal(c.devices, 6); /* one of each driver */
 	assert_true(c.sweep.set);
 	for (const struct key *key = key_table; key->name; key++) {
 		snprintf(word, sizeof(word), "%s:", key->name);
@@ -518,6 +701,12 @@ int main(int argc, char **argv)
 	    cmocka_unit_test(every_shorter_file_is_taken_or_refused_in_peace),
 	    cmocka_unit_test(memory_that_runs_out_anywhere_is_said_and_nothing_is_kept),
 	    cmocka_unit_test(edit_distance_counts_swaps_as_one),
+	    cmocka_unit_test(every_value_of_a_scanner_arrives),
+	    cmocka_unit_test(a_scanner_that_is_only_plugged_in_keeps_its_own_settings),
+	    cmocka_unit_test(a_scanner_is_connected_in_a_way_it_has),
+	    cmocka_unit_test(two_scanners_have_two_lines),
+	    cmocka_unit_test(only_who_has_an_encoder_or_a_servo_tilts),
+	    cmocka_unit_test(values_of_a_scanner_out_of_range_are_refused),
 	    cmocka_unit_test(the_scanner_gets_its_mount_masks_and_pose),
 	    cmocka_unit_test(the_manual_in_the_repository_is_the_tables),
 	    cmocka_unit_test(the_manual_is_a_configuration_and_names_every_key),

@@ -52,13 +52,14 @@ FUZZ := $(patsubst tests/%.c,%,$(wildcard tests/fuzz_*.c))
 LIBRARIES := $(B)/libtools.a $(B)/libdaemon.a $(B)/libdrivers.a $(B)/libconfig.a $(B)/libcore.a
 
 .SECONDARY:
-.PHONY: all tests check demo bench soak fuzz lint format deps install clean help run-check run-demo needed
+.PHONY: all tests check check-systemd check-vm check-vm-systemd demo bench soak fuzz lint format deps install clean help run-check run-demo needed
 all: needed $(B)/facetd $(B)/facet
 tests: needed $(addprefix $(B)/tests/,$(TESTS) $(PROGRAMS))
 
 help:
 	@echo 'make [config=release|debug|sanitize|thread]   build/facetd and build/facet'
 	@echo 'make check   install what tests need, build, run them      make demo   a simulated robot, a mesh, a picture'
+	@echo 'make check-systemd | check-vm | check-vm-systemd   the daemon under a real systemd, a real kernel, both'
 	@echo 'make bench   figures of docs/features.md                   make fuzz   every fuzz target, FUZZ_SECONDS=300 each'
 	@echo 'make soak    ten minutes of faults                         make lint   layers, warnings, format, static checks'
 	@echo 'make format | deps | install DESTDIR= PREFIX= | clean'
@@ -112,6 +113,12 @@ ifeq ($(config),sanitize)
 	@echo 'under ThreadSanitizer:'
 	@tests/run build/thread $(addprefix build/thread/tests/,$(THREADED))
 endif
+
+# Real kernels and a real systemd; what cannot be had here is a skipped row (tests/tier).
+check-systemd check-vm check-vm-systemd:
+	@tools/deps build
+	@$(MAKE) --no-print-directory config=$(config) all $(addprefix $(B)/tests/,$(PROGRAMS))
+	@tests/tier $(@:check-%=%) $(B)
 
 demo:
 	@tools/deps build

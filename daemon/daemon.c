@@ -172,7 +172,7 @@ static struct watcher *make_watcher(struct daemon *d, int device, int fd)
 	return watcher;
 }
 
-static void watch_device(void *ctx, int device, int fd, bool writable)
+static void watch_device(void *ctx, int device, int fd, bool readable, bool writable)
 {
 	struct daemon *d = ctx;
 
@@ -183,7 +183,8 @@ static void watch_device(void *ctx, int device, int fd, bool writable)
 	if (!d->watcher[device])
 		d->watcher[device] = make_watcher(d, device, fd);
 	if (d->watcher[device])
-		uv_poll_start(&d->watcher[device]->poll, UV_READABLE | (writable ? UV_WRITABLE : 0), on_device);
+		uv_poll_start(&d->watcher[device]->poll, (readable ? UV_READABLE : 0) | (writable ? UV_WRITABLE : 0),
+		              on_device);
 }
 
 static void on_record(void *ctx, const struct record *record)

@@ -2,17 +2,20 @@
  *
  *             open                     dialogue says so
  *   closed ─────────► configuring ─────────────────────► streaming        no dialogue: streaming at once
- *     ▲                    │ open failed, read or write failed, dialogue gave up │
- *     │ back-off is over   ▼                                                     ▼
- *     └────────────── backing off ◄──────────────────────────────────────────────┘
+ *     ▲                 │   ▲                              │   │
+ *     │  open failed,   │   └──────────────────────────────┘   │ read or write failed, dialogue gave up,
+ *     │  ...            ▼     dialogue begins anew             ▼ no telegram in all that it sends
+ *     └────────── backing off ◄────────────────────────────────┘
+ *       back-off is over
  *
- * Nothing here waits. A device that sends without pause gets a bounded number of reads a turn, and the loop comes back
- * to it after the others; one that takes no bytes keeps what it was to be sent, and nothing else is written to it
- * meanwhile. What a dialogue asks for is done in the order write, line rate, flush; the rate waits until all bytes of
- * the write are with the kernel.
+ * Nothing here waits, and no device can hold up another: one that sends without pause gets a bounded number of reads a
+ * turn, and a bounded number of bytes a second, beyond which its descriptor is not watched for a while; one that takes no
+ * bytes keeps what it was to be sent, and nothing else is written to it meanwhile. What a dialogue asks for is done in
+ * the order write, line rate, flush; the rate waits until all bytes of the write are with the kernel.
  *
  * Only transitions are logged, and a failure that repeats itself word by word only once until the device has streamed
- * again: an unplugged scanner costs two lines, not two a second. */
+ * again: an unplugged scanner costs two lines, not two a second. A device that comes and goes within SUPERVISOR_STEADY_NS
+ * again and again is said to stream only when it has done so for that long. */
 #include "daemon/supervisor.h"
 
 #include <assert.h>
@@ -23,6 +26,7 @@
 
 #define READ_BYTES 4096
 #define STEPS_MAX  16           /* of a dialogue in one turn */
+#define FLAPS_TOLD 3            /* short streams that are told; who goes on so is told when it lasts */
 #define BLOCKED_NS 2000000000ll /* a device that takes no bytes for so long is lost */
 
 struct line {
@@ -33,11 +37,18 @@ struct line {
 	struct supervisor_device status;
 	int64_t deadline_ns, backoff_ns;
 	int64_t blocked_ns; /* since when bytes wait to be taken */
+	bool taken;         /* a byte was, since it was opened */
+	/* What it may still send, and when that was reckoned; reading waits until then while `paused`. */
+	int64_t budget_bytes, budget_ns, resume_ns;
+	bool paused;
+	size_t noise_bytes; /* since the last telegram */
 	/* What the last step still owes. */
 	uint8_t unwritten[sizeof(((struct dialogue_step *)0)->write)];
 	size_t unwritten_len;
 	uint32_t baud;
 	bool flush, watching_writable, stopping;
+	int flaps;        /* short streams in a row */
+	bool untold;      /* it streams, and nobody was told */
 	char logged[160]; /* the failure that was logged last; empty since it streamed */
 };
 
@@ -69,47 +80,80 @@ static void set_state(struct line *line, enum supervisor_state state, int64_t t_
 
 /* Closing and opening */
 
+static void log_device(struct supervisor *s, struct line *line, int priority, const char *text)
+{
+	s->host.log(s->host.ctx, index_of(s, line), priority, text);
+}
+
 static void close_line(struct supervisor *s, struct line *line, enum supervisor_state state, int64_t t_ns)
 {
 	if (line->link) {
-		s->host.watch(s->host.ctx, index_of(s, line), -1, false);
+		s->host.watch(s->host.ctx, index_of(s, line), -1, false, false);
 		line->driver->link_close(line->link);
 		line->link = NULL;
 	}
 	line->unwritten_len = 0;
 	line->baud = 0;
-	line->flush = line->watching_writable = false;
+	line->flush = line->watching_writable = line->paused = false;
 	line->deadline_ns = INT64_MAX;
 	set_state(line, state, t_ns);
 }
 
+static void tell_streaming(struct supervisor *s, struct line *line)
+{
+	line->untold = false;
+	line->logged[0] = 0;
+	log_device(s, line, LOG_INFO, "streaming");
+}
+
+static void begin_streaming(struct supervisor *s, struct line *line, int64_t t_ns)
+{
+	if (line->status.state == SUPERVISOR_STREAMING)
+		return;
+	set_state(line, SUPERVISOR_STREAMING, t_ns);
+	line->status.error[0] = 0;
+	line->untold = line->flaps >= FLAPS_TOLD;
+	if (!line->untold)
+		tell_streaming(s, line);
+}
+
+/* The stream, if there was one, is over; what comes next is said, unless that was said already. */
+static void leave(struct supervisor *s, struct line *line, const char *why, const char *next, int64_t t_ns)
+{
+	bool streamed = line->status.state == SUPERVISOR_STREAMING, told;
+	bool steady = streamed && t_ns - line->status.since_ns >= SUPERVISOR_STEADY_NS;
+
+	if (steady && line->untold)
+		tell_streaming(s, line);
+	told = streamed && !line->untold;
+	if (streamed)
+		line->flaps = steady ? 0 : line->flaps + 1;
+	if (steady || line->backoff_ns == 0)
+		line->backoff_ns = SUPERVISOR_BACKOFF_MIN_NS;
+	line->untold = false;
+	line->status.losses++;
+	snprintf(line->status.error, sizeof(line->status.error), "%s", why);
+	if (told || strcmp(line->logged, line->status.error) != 0) {
+		char text[220];
+
+		snprintf(text, sizeof(text), "%s: %s; %s", told ? "lost" : "not ready", line->status.error, next);
+		log_device(s, line, LOG_WARNING, text);
+		snprintf(line->logged, sizeof(line->logged), "%s", line->status.error);
+	}
+}
+
 static void lose(struct supervisor *s, struct line *line, const char *why, int64_t t_ns)
 {
-	bool steady =
-	    line->status.state == SUPERVISOR_STREAMING && t_ns - line->status.since_ns >= SUPERVISOR_STEADY_NS;
-	bool streamed = line->status.state == SUPERVISOR_STREAMING;
-
 	if (line->stopping) {
 		close_line(s, line, SUPERVISOR_CLOSED, t_ns);
 		return;
 	}
-	if (steady || line->backoff_ns == 0)
-		line->backoff_ns = SUPERVISOR_BACKOFF_MIN_NS;
-	line->status.losses++;
-	snprintf(line->status.error, sizeof(line->status.error), "%s", why);
+	leave(s, line, why, "trying again", t_ns);
 	close_line(s, line, SUPERVISOR_BACKING_OFF, t_ns);
 	line->deadline_ns = t_ns + line->backoff_ns;
 	line->backoff_ns *= 2;
 	if (line->backoff_ns > SUPERVISOR_BACKOFF_MAX_NS)
 		line->backoff_ns = SUPERVISOR_BACKOFF_MAX_NS;
-	if (streamed || strcmp(line->logged, line->status.error) != 0) {
-		char text[220];
-
-		snprintf(text, sizeof(text), "%s: %s; trying again", streamed ? "lost" : "not ready",
-		         line->status.error);
-		s->host.log(s->host.ctx, index_of(s, line), LOG_WARNING, text);
-		snprintf(line->logged, sizeof(line->logged), "%s", line->status.error);
-	}
 }
 
 static void lose_errno(struct supervisor *s, struct line *line, const char *doing, int error, int64_t t_ns)
@@ -120,14 +164,11 @@ static void lose_errno(struct supervisor *s, struct line *line, const char *doin
 	lose(s, line, text, t_ns);
 }
 
-static void begin_streaming(struct supervisor *s, struct line *line, int64_t t_ns)
+/* The link stands, and the device is set up anew. */
+static void reconfigure(struct supervisor *s, struct line *line, const char *why, int64_t t_ns)
 {
-	if (line->status.state == SUPERVISOR_STREAMING)
-		return;
-	set_state(line, SUPERVISOR_STREAMING, t_ns);
-	line->status.error[0] = 0;
-	line->logged[0] = 0;
-	s->host.log(s->host.ctx, index_of(s, line), LOG_INFO, "streaming");
+	leave(s, line, why[0] ? why : "it stopped", "setting it up again", t_ns);
+	set_state(line, SUPERVISOR_CONFIGURING, t_ns);
 }
 
 /* Writing */
@@ -135,7 +176,14 @@ static void begin_streaming(struct supervisor *s, struct line *line, int64_t t_n
 static void watch(struct supervisor *s, struct line *line)
 {
 	line->watching_writable = line->unwritten_len > 0;
-	s->host.watch(s->host.ctx, index_of(s, line), line->driver->link_fd(line->link), line->watching_writable);
+	s->host.watch(s->host.ctx, index_of(s, line), line->driver->link_fd(line->link), !line->paused,
+	              line->watching_writable);
+}
+
+/* Room for bytes is waited for up to here. */
+static int64_t patience_ns(const struct line *line)
+{
+	return line->blocked_ns + (line->taken ? BLOCKED_NS : SUPERVISOR_OPEN_NS);
 }
 
 /* Writes what is owed, as far as the device takes it; what was taken is recorded. False: the device was lost. */
@@ -153,6 +201,7 @@ static bool write_owed(struct supervisor *s, struct line *line, int64_t t_ns)
 		uint8_t written[sizeof(line->unwritten)];
 
 		assert((size_t)n <= line->unwritten_len);
+		line->taken = true;
 		memcpy(written, line->unwritten, (size_t)n);
 		line->unwritten_len -= (size_t)n;
 		memmove(line->unwritten, line->unwritten + n, line->unwritten_len);
@@ -172,8 +221,11 @@ static bool settle(struct supervisor *s, struct line *line, int64_t t_ns)
 	char error[160] = "";
 
 	if (line->unwritten_len > 0 && (!write_owed(s, line, t_ns) || line->unwritten_len > 0)) {
-		if (line->link && t_ns - line->blocked_ns >= BLOCKED_NS)
-			lose(s, line, "the device takes no bytes", t_ns);
+		if (line->link && t_ns >= patience_ns(line))
+			lose(s, line,
+			     line->taken ? "the device takes no bytes"
+			                 : "the device takes no bytes: is it there, and switched on?",
+			     t_ns);
 		return false;
 	}
 	if (line->baud && line->driver->link_baud) {
@@ -219,6 +271,8 @@ static void converse(struct supervisor *s, struct line *line, int64_t t_ns)
 		}
 		if (step.state == DIALOGUE_STREAMING)
 			begin_streaming(s, line, t_ns);
+		else if (line->status.state == SUPERVISOR_STREAMING && !line->stopping)
+			reconfigure(s, line, step.error, t_ns);
 		take_step(line, &step, t_ns);
 		asked = step.write_len > 0 || step.baud || step.flush;
 		if (asked && !settle(s, line, t_ns))
@@ -231,18 +285,30 @@ static void converse(struct supervisor *s, struct line *line, int64_t t_ns)
 		line->deadline_ns = t_ns + 1000000;
 }
 
+static void record_opened(struct supervisor *s, struct line *line, int64_t t_ns)
+{
+	static const uint8_t nothing;
+	struct record record = {
+	    .log_ns = t_ns, .t_ns = t_ns, .device = index_of(s, line), .direction = LINK_OPENED, .bytes = &nothing};
+
+	s->host.record(s->host.ctx, &record);
+}
+
 static void open_line(struct supervisor *s, struct line *line, int64_t t_ns)
 {
 	char error[160] = "";
 
 	line->status.opens++;
 	line->deadline_ns = INT64_MAX;
+	line->taken = false;
+	line->noise_bytes = 0;
 	if (line->driver->link_open) {
 		line->link = line->driver->link_open(line->config, error);
 		if (!line->link) {
 			lose(s, line, error, t_ns);
 			return;
 		}
+		record_opened(s, line, t_ns);
 	}
 	if (line->link && line->driver->link_fd(line->link) >= 0)
 		watch(s, line);
@@ -255,6 +321,50 @@ static void open_line(struct supervisor *s, struct line *line, int64_t t_ns)
 	}
 }
 
+/* Reading */
+
+/* Has it sent what it may for now? Then reading waits. */
+static bool overspent(struct supervisor *s, struct line *line, int64_t t_ns)
+{
+	int64_t since_ns = t_ns - line->budget_ns;
+
+	line->budget_ns = t_ns;
+	if (since_ns >= 1000000000)
+		line->budget_bytes = SUPERVISOR_BURST_BYTES;
+	else
+		line->budget_bytes += since_ns * SUPERVISOR_BYTES_PER_S / 1000000000;
+	if (line->budget_bytes > SUPERVISOR_BURST_BYTES)
+		line->budget_bytes = SUPERVISOR_BURST_BYTES;
+	if (line->budget_bytes > 0)
+		return false;
+	line->paused = true;
+	line->resume_ns = t_ns + SUPERVISOR_SLICE_NS;
+	watch(s, line);
+	return true;
+}
+
+static void resume(struct supervisor *s, struct line *line)
+{
+	line->paused = false;
+	watch(s, line);
+}
+
+static void take_bytes(struct supervisor *s, struct line *line, const struct record *record, int64_t t_ns)
+{
+	char text[160];
+
+	line->status.records++;
+	line->status.bytes_in += record->len;
+	line->budget_bytes -= (int64_t)record->len;
+	line->noise_bytes += record->len;
+	s->host.record(s->host.ctx, record);
+	if (line->noise_bytes < SUPERVISOR_NOISE_BYTES)
+		return;
+	snprintf(text, sizeof(text), "it sends what is no telegram of driver %s; is it another device?",
+	         line->driver->name);
+	lose(s, line, text, t_ns);
+}
+
 /* What the loop calls */
 
 /* Reads with a bound; false: the device was lost. */
@@ -262,7 +372,7 @@ static bool read_line(struct supervisor *s, struct line *line, int64_t t_ns)
 {
 	uint8_t bytes[READ_BYTES];
 
-	for (int i = 0; i < SUPERVISOR_READS_MAX && line->link; i++) {
+	for (int i = 0; i < SUPERVISOR_READS_MAX && line->link && !overspent(s, line, t_ns); i++) {
 		struct record record = {.log_ns = t_ns, .t_ns = t_ns, .device = index_of(s, line), .bytes = bytes};
 		ssize_t n = line->driver->link_read(line->link, bytes, sizeof(bytes), &record.t_ns);
 
@@ -274,9 +384,7 @@ static bool read_line(struct supervisor *s, struct line *line, int64_t t_ns)
 		}
 		record.direction = FROM_DEVICE;
 		record.len = (size_t)n;
-		line->status.records++;
-		line->status.bytes_in += (uint64_t)n;
-		s->host.record(s->host.ctx, &record);
+		take_bytes(s, line, &record, t_ns);
 	}
 	return line->link != NULL;
 }
@@ -291,7 +399,7 @@ void supervisor_ready(struct supervisor *s, int device, bool readable, bool writ
 		return;
 	if (writable && line->unwritten_len > 0 && !write_owed(s, line, t_ns))
 		return;
-	if (readable && !read_line(s, line, t_ns))
+	if (readable && !line->paused && !read_line(s, line, t_ns))
 		return;
 	converse(s, line, t_ns);
 }
@@ -299,7 +407,13 @@ void supervisor_ready(struct supervisor *s, int device, bool readable, bool writ
 /* While bytes wait to be taken the dialogue's own deadline does not count. */
 static int64_t due_ns(const struct line *line)
 {
-	return line->link && line->unwritten_len > 0 ? line->blocked_ns + BLOCKED_NS : line->deadline_ns;
+	int64_t due_ns = line->link && line->unwritten_len > 0 ? patience_ns(line) : line->deadline_ns;
+
+	if (line->paused && line->resume_ns < due_ns)
+		due_ns = line->resume_ns;
+	if (line->untold && line->status.since_ns + SUPERVISOR_STEADY_NS < due_ns)
+		due_ns = line->status.since_ns + SUPERVISOR_STEADY_NS;
+	return due_ns;
 }
 
 void supervisor_timer(struct supervisor *s, int64_t t_ns)
@@ -311,6 +425,10 @@ void supervisor_timer(struct supervisor *s, int64_t t_ns)
 			close_line(s, line, SUPERVISOR_CLOSED, t_ns);
 		if (due_ns(line) > t_ns)
 			continue;
+		if (line->paused && t_ns >= line->resume_ns)
+			resume(s, line);
+		if (line->untold && t_ns - line->status.since_ns >= SUPERVISOR_STEADY_NS)
+			tell_streaming(s, line);
 		if (line->status.state == SUPERVISOR_BACKING_OFF)
 			open_line(s, line, t_ns);
 		else if (line->link)
@@ -334,6 +452,7 @@ void supervisor_reply(struct supervisor *s, int device, const struct reply *repl
 {
 	struct line *line = &s->line[device];
 
+	line->noise_bytes = 0;
 	if (line->link && line->dialogue)
 		line->driver->dialogue_reply(line->dialogue, reply);
 }
@@ -343,6 +462,7 @@ void supervisor_data(struct supervisor *s, int device, int64_t t_ns)
 	struct line *line = &s->line[device];
 
 	line->status.decoded++;
+	line->noise_bytes = 0;
 	if (line->link && line->dialogue)
 		line->driver->dialogue_data(line->dialogue, t_ns);
 }
@@ -398,6 +518,7 @@ struct supervisor *supervisor_create(const struct config *config, const struct d
 		line->driver = drivers[i];
 		line->config = &config->device[i];
 		line->deadline_ns = INT64_MAX;
+		line->budget_bytes = SUPERVISOR_BURST_BYTES;
 		if (!line->driver->dialogue_create)
 			continue;
 		line->dialogue = line->driver->dialogue_create(config, i);

@@ -6,16 +6,24 @@
 #include "drivers/driver.h"
 
 #define SUPERVISOR_BACKOFF_MIN_NS 250000000ll  /* before the first new try; doubled with every failure ... */
-#define SUPERVISOR_BACKOFF_MAX_NS 2000000000ll /* ... up to here */
-#define SUPERVISOR_STEADY_NS      2000000000ll /* who streamed so long begins with the first again */
+#define SUPERVISOR_BACKOFF_MAX_NS 1000000000ll /* ... up to here: who is back is asked within 2 s */
+#define SUPERVISOR_OPEN_NS        1500000000ll /* whoever takes no byte for so long after it was opened is not there */
+#define SUPERVISOR_STEADY_NS      2000000000ll /* who streamed so long begins with the first back-off again */
 #define SUPERVISOR_STOP_NS        1000000000ll /* an orderly end takes no longer */
 #define SUPERVISOR_READS_MAX      16           /* of one device in one turn of the loop */
+/* What one device may cost: beyond it reading waits, and the kernel holds the rest. Five echoes of an LMS5xx in CoLa-A,
+ * the most that any device has to say, are 1 MB/s. */
+#define SUPERVISOR_BYTES_PER_S 2000000
+#define SUPERVISOR_BURST_BYTES 262144
+#define SUPERVISOR_SLICE_NS    20000000ll /* reading waits for so long then */
+/* Whoever sends so much without one telegram is another device: four of the longest telegrams. */
+#define SUPERVISOR_NOISE_BYTES 262144
 
 struct supervisor_host {
 	void *ctx;
-	/* Watch `fd` for reading, and for room to write if `writable`; -1: watch nothing for this device any more. */
-	void (*watch)(void *ctx, int device, int fd, bool writable);
-	/* A record was read or written: into the journal and the pipeline, which may call supervisor_reply and _data. */
+	/* Watch `fd` for bytes to read, for room to write, for both or neither; -1: it is closed, forget it. */
+	void (*watch)(void *ctx, int device, int fd, bool readable, bool writable);
+	/* A record was read or written, or the link was opened: into the journal and the pipeline, which may call supervisor_reply and _data. */
 	void (*record)(void *ctx, const struct record *);
 	/* A transition; `priority` as in syslog.h. */
 	void (*log)(void *ctx, int device, int priority, const char *text);
@@ -27,7 +35,8 @@ struct supervisor_device {
 	enum supervisor_state state;
 	int64_t since_ns;
 	char error[160]; /* of the last failure; empty since it streams */
-	uint64_t records, bytes_in, bytes_out, opens, losses;
+	uint64_t records, bytes_in, bytes_out, opens;
+	uint64_t losses;  /* tries that failed, and streams that ended */
 	uint64_t decoded; /* profiles, angles or poses */
 };
 

@@ -82,7 +82,8 @@ struct dialogue_step {
 	bool flush;          /* discard what the line holds */
 	int64_t deadline_ns; /* call again at the latest then; INT64_MAX: only on a reply */
 	enum dialogue_state { DIALOGUE_CONFIGURING, DIALOGUE_STREAMING, DIALOGUE_FAILED } state;
-	char error[160]; /* DIALOGUE_FAILED: one sentence, what is wrong and what to do */
+	/* DIALOGUE_FAILED: one sentence, what is wrong and what to do. CONFIGURING after STREAMING: why it begins anew. */
+	char error[160];
 };
 
 struct decoder;

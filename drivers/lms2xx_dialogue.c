@@ -99,6 +99,7 @@ struct dialogue {
 	bool variant_fits;
 	struct lms2xx_config config; /* to be written */
 	int64_t heard_ns;            /* last valid telegram */
+	const char *why; /* everything begins anew, NULL: it is the first time */
 	char error[160];
 };
 
@@ -390,6 +391,7 @@ void lms2xx_dialogue_reply(struct dialogue *d, const struct reply *reply)
 		return;
 	d->heard_ns = reply->t_ns;
 	if (reply->kind == LMS2XX_POWER_ON && d->stage != STAGE_STOP) {
+		d->why = "it was switched off and on";
 		search(d, rate_now(d));
 		return;
 	}
@@ -483,8 +485,10 @@ void lms2xx_dialogue_step(struct dialogue *d, int64_t t_ns, struct dialogue_step
 		enter(d, d->after_settle, t_ns);
 		d->after_settle = STAGE_PROBE;
 	}
-	if (d->stage == STAGE_STREAMING && t_ns - d->heard_ns >= LMS2XX_QUIET_NS)
+	if (d->stage == STAGE_STREAMING && t_ns - d->heard_ns >= LMS2XX_QUIET_NS) {
+		d->why = "it stopped sending";
 		search(d, 0);
+	}
 	if (exchanges[d->stage].expect != 0)
 		exchange_step(d, t_ns, ret);
 	if (d->stage == STAGE_LINE && ret->write_len == 0)
@@ -498,6 +502,7 @@ void lms2xx_dialogue_step(struct dialogue *d, int64_t t_ns, struct dialogue_step
 		ret->deadline_ns = d->heard_ns + LMS2XX_QUIET_NS;
 	} else {
 		ret->deadline_ns = d->stage == STAGE_SETTLE ? d->until_ns : d->next_ns;
+		snprintf(ret->error, sizeof ret->error, "%s", d->why ? d->why : "");
 	}
 }
 

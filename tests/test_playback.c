@@ -279,11 +279,12 @@ static int64_t realtime_ns(void)
 	return (int64_t)ts.tv_sec * 1000000000 + ts.tv_nsec;
 }
 
-static void on_watch(void *ctx, int device, int fd, bool writable)
+static void on_watch(void *ctx, int device, int fd, bool readable, bool writable)
 {
 	struct reader *reader = ctx;
 
-	reader->p[device] = (struct pollfd){.fd = fd, .events = (short)(POLLIN | (writable ? POLLOUT : 0))};
+	reader->p[device] =
+	    (struct pollfd){.fd = fd, .events = (short)((readable ? POLLIN : 0) | (writable ? POLLOUT : 0))};
 }
 
 static void on_record(void *ctx, const struct record *record)

@@ -29,7 +29,8 @@ struct dialogue {
 };
 
 static struct world {
-	bool absent, dead_read, dead_write, full, endless, never_ends, asks_without_end;
+	bool absent, dead_read, dead_write, full, endless, never_ends, asks_without_end, begins_anew;
+	size_t at_once;   /* a read delivers so many of its first byte */
 	char pending[64]; /* what the device has to say */
 	char heard[64];   /* what it was told */
 	int opens, closes, bauds, flushes, resets;
@@ -45,7 +46,7 @@ static int logs;
 static struct supervisor *supervisor;
 static char records[2000];
 static int watched[DEVICES];
-static bool watched_writable[DEVICES];
+static bool watched_readable[DEVICES], watched_writable[DEVICES];
 
 static struct link *fake_open(const struct config_device *config, char error[160])
 {
@@ -72,10 +73,14 @@ static ssize_t fake_read(struct link *link, uint8_t *buf, size_t cap, int64_t *t
 	struct world *w = &world[link->device];
 	size_t n = strlen(w->pending);
 
-	(void)cap;
 	(void)t_ns;
 	if (w->dead_read)
 		return -EIO;
+	if (w->at_once) {
+		assert_true(w->at_once <= cap);
+		memset(buf, w->pending[0], w->at_once);
+		return (ssize_t)w->at_once;
+	}
 	memcpy(buf, w->pending, n);
 	if (!w->endless)
 		w->pending[0] = 0;
@@ -158,6 +163,13 @@ static void fake_step(struct dialogue *dialogue, int64_t t_ns, struct dialogue_s
 		ret->deadline_ns = t_ns;
 		return;
 	}
+	if (world[dialogue->device].begins_anew) {
+		world[dialogue->device].begins_anew = false;
+		dialogue->phase = GREETING;
+		dialogue->deadline_ns = t_ns + SECOND;
+		ret->state = DIALOGUE_CONFIGURING;
+		snprintf(ret->error, sizeof(ret->error), "it was switched off and on");
+	}
 	if (dialogue->phase == ENDING) {
 		ret->deadline_ns = INT64_MAX;
 		if (!world[dialogue->device].never_ends)
@@ -209,25 +221,32 @@ static const struct driver silent = {.name = "silent",
 static const struct driver linkless = {.name = "linkless"};
 
 /* The host: what a pipeline does with the bytes. */
-static void host_watch(void *ctx, int device, int fd, bool writable)
+static void host_watch(void *ctx, int device, int fd, bool readable, bool writable)
 {
 	(void)ctx;
 	watched[device] = fd;
+	watched_readable[device] = readable;
 	watched_writable[device] = writable;
 }
 
 static void host_record(void *ctx, const struct record *record)
 {
-	struct reply reply = {.t_ns = record->t_ns, .kind = record->bytes[0]};
+	struct reply reply = {.t_ns = record->t_ns};
 	char text[80];
 
 	(void)ctx;
-	snprintf(text, sizeof(text), "%d%c%.*s ", record->device, record->direction == TO_DEVICE ? '<' : '>',
+	snprintf(text, sizeof(text), "%d%c%.*s ", record->device,
+	         record->direction == LINK_OPENED ? '='
+	         : record->direction == TO_DEVICE ? '<'
+	                                          : '>',
 	         (int)record->len, (const char *)record->bytes);
 	if (strlen(records) + strlen(text) < sizeof(records))
 		strcat(records, text);
-	if (record->direction == TO_DEVICE)
+	if (record->direction != FROM_DEVICE)
 		return;
+	reply.kind = record->bytes[0];
+	if (reply.kind == '?')
+		return; /* no telegram */
 	if (record->bytes[0] == 'd')
 		supervisor_data(supervisor, record->device, record->log_ns);
 	else
@@ -300,7 +319,7 @@ static void a_device_is_configured_then_streams(void **state)
 	assert_string_equal(world[0].heard, "go");
 	assert_int_equal(world[0].baud, 38400);
 	assert_int_equal(world[0].flushes, 1);
-	assert_string_equal(records, "0>hi 0<g 0<o ");
+	assert_string_equal(records, "0= 0>hi 0<g 0<o ");
 	assert_int_equal(logs, 1);
 	assert_string_equal(log_lines[0].text, "streaming");
 	say(0, "d", 900 * MS);
@@ -331,8 +350,8 @@ static void a_device_that_takes_no_bytes_is_lost_after_a_while(void **state)
 {
 	(void)state;
 	begin(&fake, NULL, NULL);
+	say(0, "hi", 0); /* it takes a byte of two */
 	world[0].full = true;
-	say(0, "hi", 0);
 	assert_int_equal(supervisor_deadline(supervisor), 2 * SECOND);
 	supervisor_timer(supervisor, 1900 * MS);
 	assert_int_equal(world[0].closes, 0);
@@ -344,7 +363,7 @@ static void a_device_that_takes_no_bytes_is_lost_after_a_while(void **state)
 
 static void an_absent_device_is_tried_again_ever_more_slowly_and_told_once(void **state)
 {
-	static const int64_t pause[] = {250, 500, 1000, 2000, 2000, 2000};
+	static const int64_t pause[] = {250, 500, 1000, 1000, 1000, 1000};
 	int64_t t_ns = 0;
 
 	(void)state;
@@ -402,7 +421,7 @@ static void a_device_that_fails_right_after_it_streams_backs_off_further(void **
 		t_ns = supervisor_deadline(supervisor);
 		supervisor_timer(supervisor, t_ns);
 	}
-	assert_int_equal(t_ns, (250 + 500 + 1000 + 2000 + 2000) * MS);
+	assert_int_equal(t_ns, (250 + 500 + 1000 + 1000 + 1000) * MS);
 	end();
 }
 
@@ -487,6 +506,171 @@ static void a_device_that_backs_off_ends_at_once(void **state)
 	end();
 }
 
+static void greet(int64_t t_ns)
+{
+	say(0, "hi", t_ns);
+	while (watched_writable[0])
+		supervisor_ready(supervisor, 0, false, true, t_ns);
+}
+
+/* What comes after an opening must not be joined to what came before it: decoders are told, before anything is written. */
+static void every_opening_is_recorded_before_the_first_write(void **state)
+{
+	(void)state;
+	begin(&fake, NULL, NULL);
+	greet(10 * MS);
+	world[0].dead_read = true;
+	say(0, "d", 20 * MS);
+	world[0].dead_read = false;
+	world[0].pending[0] = 0;
+	supervisor_timer(supervisor, supervisor_deadline(supervisor));
+	greet(500 * MS);
+	assert_string_equal(records, "0= 0>hi 0<g 0<o 0= 0>hi 0<g 0<o ");
+	end();
+	begin(&linkless, NULL, NULL);
+	assert_string_equal(records, "");
+	end();
+}
+
+/* Whenever it comes back: it is opened within a second of that, and its first request goes out with the opening. */
+static void a_device_that_is_back_is_opened_within_a_second(void **state)
+{
+	(void)state;
+	for (int64_t back_ns = 10 * SECOND; back_ns < 12 * SECOND; back_ns += 70 * MS) {
+		int opens;
+
+		memset(world, 0, sizeof(world));
+		world[0].absent = true;
+		start(&fake, NULL, NULL);
+		supervisor_start(supervisor, 0);
+		while (supervisor_deadline(supervisor) < back_ns)
+			supervisor_timer(supervisor, supervisor_deadline(supervisor));
+		world[0].absent = false;
+		opens = world[0].opens;
+		assert_true(supervisor_deadline(supervisor) - back_ns <= SECOND);
+		supervisor_timer(supervisor, supervisor_deadline(supervisor));
+		assert_int_equal(world[0].opens, opens + 1);
+		expect_state(0, SUPERVISOR_CONFIGURING);
+		end();
+	}
+}
+
+/* A connection that neither stands nor fails: the next try is begun soon enough for somebody who came meanwhile. */
+static void an_opening_that_hangs_is_given_up_after_a_second_and_a_half(void **state)
+{
+	(void)state;
+	begin(&fake, NULL, NULL);
+	world[0].full = true;
+	world[0].dialogue->phase = ASKED;
+	supervisor_ready(supervisor, 0, true, false, 0);
+	assert_int_equal(supervisor_deadline(supervisor), SUPERVISOR_OPEN_NS);
+	supervisor_timer(supervisor, SUPERVISOR_OPEN_NS);
+	expect_state(0, SUPERVISOR_BACKING_OFF);
+	assert_non_null(strstr(supervisor_device(supervisor, 0)->error, "switched on"));
+	end();
+}
+
+/* Sends without pause what makes telegrams: it costs its budget and no more, and stays. */
+static void a_device_at_full_rate_is_read_within_its_budget(void **state)
+{
+	const int64_t seconds = 10;
+	uint64_t bytes;
+
+	(void)state;
+	begin(&silent, &silent, NULL);
+	strcpy(world[0].pending, "d");
+	world[0].at_once = 4096;
+	strcpy(world[1].pending, "d");
+	world[1].endless = true;
+	for (int64_t t_ns = 0; t_ns < seconds * SECOND; t_ns += MS) {
+		if (supervisor_deadline(supervisor) <= t_ns)
+			supervisor_timer(supervisor, t_ns);
+		if (watched_readable[0])
+			supervisor_ready(supervisor, 0, true, false, t_ns);
+		assert_true(watched_readable[1]);
+		supervisor_ready(supervisor, 1, true, false, t_ns);
+	}
+	bytes = supervisor_device(supervisor, 0)->bytes_in;
+	assert_true(bytes <= SUPERVISOR_BURST_BYTES + 4096 + seconds * SUPERVISOR_BYTES_PER_S);
+	assert_true(bytes >= (uint64_t)seconds * SUPERVISOR_BYTES_PER_S * 9 / 10);
+	assert_int_equal(supervisor_device(supervisor, 1)->decoded, seconds * 1000 * SUPERVISOR_READS_MAX);
+	assert_int_equal(supervisor_device(supervisor, 0)->losses, 0);
+	assert_int_equal(logs, 2);
+	end();
+}
+
+/* Sends without pause what makes none: it is lost again and again, told once, and costs little. */
+static void a_device_of_another_kind_is_lost_with_a_sentence_and_few_lines(void **state)
+{
+	const int64_t seconds = 60;
+
+	(void)state;
+	begin(&silent, NULL, NULL);
+	strcpy(world[0].pending, "?");
+	world[0].at_once = 4096;
+	for (int64_t t_ns = 0; t_ns < seconds * SECOND; t_ns += MS) {
+		if (supervisor_deadline(supervisor) <= t_ns)
+			supervisor_timer(supervisor, t_ns);
+		if (watched[0] >= 0 && watched_readable[0])
+			supervisor_ready(supervisor, 0, true, false, t_ns);
+	}
+	assert_int_equal(logs, 6);
+	assert_string_equal(log_lines[0].text, "streaming");
+	assert_string_equal(log_lines[1].text,
+	                    "lost: it sends what is no telegram of driver silent; is it another device?; trying again");
+	assert_true(supervisor_device(supervisor, 0)->losses >= (uint64_t)seconds - 2);
+	assert_true(supervisor_device(supervisor, 0)->bytes_in <=
+	            (uint64_t)(seconds + 4) * (SUPERVISOR_NOISE_BYTES + 4096));
+	world[0].at_once = 0;
+	strcpy(world[0].pending, "d");
+	supervisor_timer(supervisor, seconds * SECOND + SECOND);
+	expect_state(0, SUPERVISOR_STREAMING);
+	assert_int_equal(logs, 6); /* it must last first */
+	assert_int_equal(supervisor_deadline(supervisor),
+	                 supervisor_device(supervisor, 0)->since_ns + SUPERVISOR_STEADY_NS);
+	supervisor_timer(supervisor, supervisor_deadline(supervisor));
+	assert_int_equal(logs, 7);
+	assert_string_equal(log_lines[6].text, "streaming");
+	end();
+}
+
+static void a_telegram_now_and_then_forgives_the_noise_between(void **state)
+{
+	(void)state;
+	begin(&silent, NULL, NULL);
+	for (int64_t t_ns = 0; t_ns < 60 * SECOND; t_ns += 100 * MS) {
+		world[0].at_once = 4096;
+		strcpy(world[0].pending, "?");
+		supervisor_timer(supervisor, t_ns);
+		supervisor_ready(supervisor, 0, true, false, t_ns);
+		world[0].at_once = 0;
+		if (t_ns % (300 * MS) == 0)
+			say(0, "d", t_ns);
+	}
+	assert_int_equal(supervisor_device(supervisor, 0)->losses, 0);
+	end();
+}
+
+/* The dialogue begins anew on a link that stands: both changes are told, and the state says what it does. */
+static void a_device_that_is_set_up_again_is_lost_and_back(void **state)
+{
+	(void)state;
+	begin(&fake, NULL, NULL);
+	greet(10 * MS);
+	expect_state(0, SUPERVISOR_STREAMING);
+	world[0].begins_anew = true;
+	say(0, "d", 5 * SECOND);
+	expect_state(0, SUPERVISOR_CONFIGURING);
+	assert_int_equal(world[0].closes, 0);
+	assert_int_equal(supervisor_device(supervisor, 0)->losses, 1);
+	greet(5 * SECOND + 10 * MS);
+	expect_state(0, SUPERVISOR_STREAMING);
+	assert_int_equal(logs, 3);
+	assert_string_equal(log_lines[1].text, "lost: it was switched off and on; setting it up again");
+	assert_string_equal(log_lines[2].text, "streaming");
+	end();
+}
+
 int main(void)
 {
 	const struct CMUnitTest tests[] = {
@@ -502,6 +686,13 @@ int main(void)
 	    cmocka_unit_test(a_device_without_a_link_just_streams),
 	    cmocka_unit_test(an_orderly_end_asks_every_device_and_waits_at_most_a_second),
 	    cmocka_unit_test(a_device_that_backs_off_ends_at_once),
+	    cmocka_unit_test(every_opening_is_recorded_before_the_first_write),
+	    cmocka_unit_test(a_device_that_is_back_is_opened_within_a_second),
+	    cmocka_unit_test(an_opening_that_hangs_is_given_up_after_a_second_and_a_half),
+	    cmocka_unit_test(a_device_at_full_rate_is_read_within_its_budget),
+	    cmocka_unit_test(a_device_of_another_kind_is_lost_with_a_sentence_and_few_lines),
+	    cmocka_unit_test(a_telegram_now_and_then_forgives_the_noise_between),
+	    cmocka_unit_test(a_device_that_is_set_up_again_is_lost_and_back),
 	};
 
 	return cmocka_run_group_tests(tests, NULL, NULL);

@@ -31,8 +31,15 @@ endif
 # -ffp-contract=off: the same bytes on every machine (law L2).
 PACKAGES := libuv yaml-0.1 jansson libpng libmodbus libsystemd
 have = $(shell pkg-config --exists $(1) 2>/dev/null && echo yes)
+# What can be left out, and what the build then says.
+ifeq ($(call have,libusb-1.0),yes)
+PACKAGES += libusb-1.0
+OPTIONS += -DHAVE_USB
+else
+LEFT_OUT += 'scanners on USB (libusb-1.0-0-dev)'
+endif
 CFLAGS_ALL := -std=c17 -D_GNU_SOURCE -I. -I$(B)/gen -MMD -MP -Wall -Wextra -Wshadow -Wstrict-prototypes \
-	-Wmissing-prototypes -Wvla -ffp-contract=off -fno-strict-aliasing -pthread $(FLAGS_$(config)) $(CFLAGS) \
+	-Wmissing-prototypes -Wvla -ffp-contract=off -fno-strict-aliasing -pthread $(FLAGS_$(config)) $(OPTIONS) $(CFLAGS) \
 	$(shell pkg-config --cflags $(PACKAGES) 2>/dev/null)
 LDFLAGS_ALL := -pthread $(FLAGS_$(config)) $(LDFLAGS)
 LIBS := $(shell pkg-config --libs $(PACKAGES) 2>/dev/null) -lm
@@ -67,6 +74,7 @@ help:
 # A missing package is named before the compiler trips over it.
 needed:
 	@missing=$$(tools/deps --missing build) || { echo "make: missing packages: $$(echo $$missing); run 'make deps'" >&2; exit 1; }
+	@for what in $(LEFT_OUT); do echo "  without $$what: 'make deps' installs it"; done
 
 $(B)/obj/%.o: %.c Makefile | needed
 	@mkdir -p $(@D)
@@ -104,7 +112,7 @@ $(B)/tests/fuzz_%: $(B)/obj/tests/fuzz_%.o $(LIBRARIES)
 
 # Purposes are installed first and the build starts in a second make, whose pkg-config then knows them.
 check:
-	@tools/deps build check check-$$(uname -m)
+	@tools/deps build optional check check-$$(uname -m)
 	@$(MAKE) --no-print-directory config=$(config) run-check
 run-check: all tests
 	@tests/run $(B)
@@ -136,7 +144,7 @@ soak: all tests
 
 FUZZ_SECONDS ?= 300
 fuzz:
-	@tools/deps build check check-$$(uname -m)
+	@tools/deps build optional check check-$$(uname -m)
 	@$(MAKE) --no-print-directory config=fuzz run-fuzz
 .PHONY: run-fuzz fuzz-targets
 fuzz-targets: needed $(addprefix $(B)/tests/,$(FUZZ))
@@ -150,13 +158,16 @@ format:
 	@clang-format -i $(shell git ls-files '*.c' '*.h')
 
 deps:
-	@tools/deps build check check-$$(uname -m) lint bench
+	@tools/deps build optional check check-$$(uname -m) lint bench
 
 install: all
 	install -d $(DESTDIR)$(PREFIX)/bin $(DESTDIR)$(PREFIX)/lib/systemd/system $(DESTDIR)$(PREFIX)/lib/sysusers.d \
-		$(DESTDIR)$(PREFIX)/share/doc/facetd
+		$(DESTDIR)$(PREFIX)/lib/udev/rules.d $(DESTDIR)$(PREFIX)/share/doc/facetd
 	install -m 755 $(B)/facetd $(B)/facet $(DESTDIR)$(PREFIX)/bin
 	sed 's|@PREFIX@|$(PREFIX)|g' systemd/facetd.service.in > $(DESTDIR)$(PREFIX)/lib/systemd/system/facetd.service
+	sed 's|@PREFIX@|$(PREFIX)|g' systemd/facetd.socket.in > $(DESTDIR)$(PREFIX)/lib/systemd/system/facetd.socket
+	install -m 644 systemd/70-facetd.rules $(DESTDIR)$(PREFIX)/lib/udev/rules.d/70-facetd.rules
+	install -m 644 systemd/dynamic-user.conf $(DESTDIR)$(PREFIX)/share/doc/facetd/dynamic-user.conf
 	install -m 644 systemd/facetd.sysusers $(DESTDIR)$(PREFIX)/lib/sysusers.d/facetd.conf
 	install -m 644 config/facetd.yaml $(DESTDIR)$(PREFIX)/share/doc/facetd/facetd.yaml
 

@@ -22,13 +22,14 @@ printf '#!/bin/sh\n' >"$prefix/bin/facetd"
 chmod 755 "$prefix/bin/facetd"
 unit=$scratch/units/facetd.service
 sed "s|@PREFIX@|$prefix|g" systemd/facetd.service.in >"$unit"
-grep -q '@[A-Z]*@' "$unit" && fail "a placeholder is left in the unit"
+sed "s|@PREFIX@|$prefix|g" systemd/facetd.socket.in >"$scratch/units/facetd.socket"
+grep -q '@[A-Z]*@' "$scratch"/units/* && fail "a placeholder is left in a unit"
 
 # Without a running systemd (a container) verify also complains about what it cannot ask; what it says of this unit counts.
-said=$(systemd-analyze verify --man=no "$unit" 2>&1)
+said=$(systemd-analyze verify --man=no "$unit" "$scratch/units/facetd.socket" 2>&1)
 status=$?
 echo "$said"
-echo "$said" | grep -q 'facetd\.service' && fail "systemd-analyze verify finds something in the unit"
+echo "$said" | grep -q 'facetd\.s' && fail "systemd-analyze verify finds something in the unit"
 [ "$status" -ne 0 ] && fail "systemd-analyze verify: status $status"
 
 report=$(systemd-analyze security --offline=true --threshold=20 --no-pager "$unit" 2>&1)
@@ -43,8 +44,8 @@ grep -v '^Protect\|^Restrict\|^SystemCall\|^Capability\|^Private\|^NoNew\|^Devic
 systemd-analyze security --offline=true --threshold=20 --no-pager "$scratch/open.service" >/dev/null 2>&1 &&
     fail "a unit without a sandbox passes the threshold"
 
-for word in Type=notify WatchdogSec= SupplementaryGroups=dialout 'DeviceAllow=char-ttyUSB' 'DeviceAllow=char-ttyACM' \
-    'DeviceAllow=char-ttyS ' RuntimeDirectory=facetd User=facetd; do
+for word in Type=notify WatchdogSec= SupplementaryGroups=dialout 'DeviceAllow=char-188 rw' 'DeviceAllow=char-166 rw' \
+    'DeviceAllow=char-189 rw' 'DeviceAllow=char-ttyS ' RuntimeDirectory=facetd User=facetd 'RestrictAddressFamilies=.* AF_NETLINK'; do
     grep -q "^$word" "$unit" || fail "the unit lacks $word"
 done
 

@@ -19,6 +19,7 @@
 #include "daemon/supervisor.h"
 
 #include <assert.h>
+#include <errno.h>
 #include <stdio.h>
 #include <stdlib.h>
 #include <string.h>
@@ -158,9 +159,12 @@ static void lose(struct supervisor *s, struct line *line, const char *why, int64
 
 static void lose_errno(struct supervisor *s, struct line *line, const char *doing, int error, int64_t t_ns)
 {
-	char text[160];
+	char text[160] = "";
 
-	snprintf(text, sizeof(text), "%s failed (%s)", doing, strerror(error));
+	if (line->driver->link_error)
+		line->driver->link_error(line->link, error, text);
+	else
+		snprintf(text, sizeof(text), "%s failed (%s)", doing, strerror(error));
 	lose(s, line, text, t_ns);
 }
 
@@ -221,7 +225,9 @@ static bool settle(struct supervisor *s, struct line *line, int64_t t_ns)
 	char error[160] = "";
 
 	if (line->unwritten_len > 0 && (!write_owed(s, line, t_ns) || line->unwritten_len > 0)) {
-		if (line->link && t_ns >= patience_ns(line))
+		if (line->link && t_ns >= patience_ns(line) && !line->taken && line->driver->link_error)
+			lose_errno(s, line, "connecting", ETIMEDOUT, t_ns);
+		else if (line->link && t_ns >= patience_ns(line))
 			lose(s, line,
 			     line->taken ? "the device takes no bytes"
 			                 : "the device takes no bytes: is it there, and switched on?",

@@ -38,6 +38,7 @@ struct cola_stream {
 	ssize_t (*read)(struct link *, uint8_t *buf, size_t cap, int64_t *t_ns);
 	ssize_t (*write)(struct link *, const uint8_t *bytes, size_t len);
 	void (*close)(struct link *);
+	void (*error)(const struct link *, int error, char ret[160]); /* as link_error; may be NULL */
 };
 struct link {
 	const struct cola_stream *stream; /* first member of what each of them allocates */
@@ -45,7 +46,6 @@ struct link {
 extern const struct cola_stream cola_tcp, cola_usb;
 
 #define COLA_PORT        2112
-#define COLA_CONNECT_NS  1500000000ll /* a TCP connection stands by then, or is given up */
 #define COLA_USB_VENDOR  0x19a2
 #define COLA_USB_PRODUCT 0x5001
 

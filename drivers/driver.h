@@ -128,6 +128,8 @@ struct driver {
 	                      size_t len);                               /* bytes taken (0: would block) or -errno */
 	int (*link_baud)(struct link *, uint32_t baud, char error[160]); /* NULL where there is none */
 	void (*link_flush)(struct link *);                               /* may be NULL */
+	/* What -`error` of read or write means here, and what to do: one sentence. May be NULL: strerror. */
+	void (*link_error)(const struct link *, int error, char ret[160]);
 	void (*link_close)(struct link *);
 };
 

@@ -16,7 +16,7 @@
 #include "drivers/driver.h"
 #include "drivers/lms2xx_wire.h"
 #include "drivers/serial.h"
-#include "tools/simulator.h"
+#include "tools/sim_device.h"
 
 #define PATIENCE_NS 60000000000ll
 
@@ -25,7 +25,7 @@ struct rig {
 	uv_loop_t loop;
 	struct scene scene;
 	struct sim_lms2xx_params params;
-	struct sim_lms2xx *sim;
+	struct sim_pty *sim;
 	/* the scene */
 	bool paced, may;
 	int scans, taken;
@@ -165,6 +165,20 @@ static void turn(struct rig *rig)
 			fail_msg("never: %s (%s)", #condition, (rig)->step.error); \
 	} while (0)
 
+static struct sim_pty *create_sim(struct rig *rig, char error[160])
+{
+	struct sim_device device;
+	assert_int_equal(sim_lms2xx_create(&rig->params, &rig->scene, (int64_t)uv_hrtime(), &device), 0);
+	return sim_pty_create(&rig->loop, rig->port, &device, error);
+}
+
+static void order(struct rig *rig, const char *kind, double value, int64_t for_ns)
+{
+	struct sim_fault fault = {.value = value, .for_ns = for_ns};
+	snprintf(fault.kind, sizeof fault.kind, "%s", kind);
+	assert_true(sim_pty_fault(rig->sim, &fault, true));
+}
+
 static void start_sim(struct rig *rig)
 {
 	char error[160] = "";
@@ -173,14 +187,14 @@ static void start_sim(struct rig *rig)
 		rig->scene.ready = scene_ready;
 		rig->scene.taken = scene_taken;
 	}
-	rig->sim = sim_lms2xx_create(&rig->loop, &rig->params, &rig->scene, error);
+	rig->sim = create_sim(rig, error);
 	if (rig->sim == NULL)
 		fail_msg("%s", error);
 }
 
 static void stop_sim(struct rig *rig)
 {
-	sim_lms2xx_destroy(rig->sim);
+	sim_pty_destroy(rig->sim);
 	rig->sim = NULL;
 	uv_run(&rig->loop, UV_RUN_NOWAIT);
 }
@@ -193,8 +207,7 @@ static int setup(void **state)
 		return -1;
 	snprintf(rig->port, sizeof rig->port, "%s/laser", rig->dir);
 	uv_loop_init(&rig->loop);
-	rig->params = (struct sim_lms2xx_params){
-	    .link = rig->port, .fast = true, .baud = 9600, .mode = 0x05, .millimetres = true};
+	rig->params = (struct sim_lms2xx_params){.fast = true, .baud = 9600, .mode = 0x05, .millimetres = true};
 	rig->config = calloc(1, sizeof *rig->config);
 	struct config_device *device = &rig->config->device[0];
 	*device = (struct config_device){.baud = 500000, .fov_deg = 180, .resolution_cdeg = 50, .mode = -1};
@@ -335,7 +348,7 @@ static void after_a_power_cycle_it_is_set_up_anew(void **state)
 	rig->config->device[0].fov_deg = 100;
 	begin(rig);
 	UNTIL(rig, rig->profiles >= 2);
-	sim_lms2xx_power_cycle(rig->sim);
+	order(rig, "power", 0, 0);
 	UNTIL(rig, rig->step.state == DIALOGUE_CONFIGURING);
 	const int before = rig->profiles;
 	UNTIL(rig, rig->profiles >= before + 2);
@@ -427,7 +440,7 @@ static void the_link_is_not_made_over_a_file(void **state)
 	assert_non_null(file);
 	fclose(file);
 	rig->scene = (struct scene){.ctx = rig, .scan = scene_scan};
-	assert_null(sim_lms2xx_create(&rig->loop, &rig->params, &rig->scene, error));
+	assert_null(create_sim(rig, error));
 	assert_non_null(strstr(error, "cannot make the link"));
 	assert_int_equal(unlink(rig->port), 0);
 }

@@ -18,6 +18,7 @@
 #include "config/address.h"
 #include "drivers/pose_line.h"
 #include "tools/output.h"
+#include "tools/sim_device.h"
 
 #define POSE_MS  10
 #define UNIT     1    /* of the servo */
@@ -29,7 +30,7 @@ struct scenario {
 	struct scenario_params params;
 	struct stage stage;
 	struct sim_servo *servo;
-	struct sim_lms2xx *laser;
+	struct sim_pty *laser;
 	uv_timer_t *timer;
 	int pose_fd;
 	struct sockaddr_un pose_address;
@@ -152,7 +153,8 @@ static int start_devices(struct scenario *s, uv_loop_t *loop, char error[SCENARI
 	                                        .slave = UNIT,
 	                                        .angle_rad = s->stage.angle_rad};
 	struct sim_lms2xx_params laser_params = {
-	    .link = laser, .fast = s->params.fast, .baud = LASER_BD, .mode = MODE_15, .millimetres = true};
+	    .fast = s->params.fast, .baud = LASER_BD, .mode = MODE_15, .millimetres = true};
+	struct sim_device device;
 
 	snprintf(laser, sizeof laser, "%.110s/laser", s->params.dir);
 	snprintf(servo, sizeof servo, "%.110s/servo", s->params.dir);
@@ -160,7 +162,11 @@ static int start_devices(struct scenario *s, uv_loop_t *loop, char error[SCENARI
 	if (!s->servo)
 		return -EIO;
 	s->stage.join(s->stage.ctx, s->servo);
-	s->laser = sim_lms2xx_create(loop, &laser_params, &s->stage.scene, error);
+	if (sim_lms2xx_create(&laser_params, &s->stage.scene, clock_ns(CLOCK_MONOTONIC), &device) < 0) {
+		snprintf(error, SCENARIO_ERROR_MAX, "out of memory");
+		return -ENOMEM;
+	}
+	s->laser = sim_pty_create(loop, laser, &device, error);
 	return s->laser ? 0 : -EIO;
 }
 
@@ -244,7 +250,7 @@ void scenario_destroy(struct scenario *s)
 	else
 		free(s->timer);
 	if (s->laser)
-		sim_lms2xx_destroy(s->laser);
+		sim_pty_destroy(s->laser);
 	sim_servo_destroy(s->servo);
 	if (s->stage.destroy)
 		s->stage.destroy(s->stage.ctx);

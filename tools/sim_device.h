@@ -11,6 +11,7 @@
 #include "tools/simulator.h"
 
 #define SIM_FAULT_TEXT_MAX 48
+#define SIM_TRANSFER_MAX   16384 /* what one transmit gives at most */
 
 /* A fault to order: "laser: garbage at 3s for 2s" is {device "laser", kind "garbage", at 3 s, for 2 s}. `value`: kinds
  * that take one, "sfa 3", "drift 200". Kinds are listed by the device. */
@@ -35,18 +36,47 @@ struct sim_device {
 	void *ctx;
 	void (*receive)(void *ctx, const uint8_t *bytes, size_t len, int64_t t_ns);
 	void (*advance)(void *ctx, int64_t t_ns);
-	/* Up to `cap` bytes that have left the device by the time of the last call; never more than one USB transfer's worth. */
+	/* Up to `cap` bytes that have left the device by the time of the last call, of one piece: as the device gave them to
+	 * its stack or its line. Pieces begin and end where telegrams do, unless a telegram was segmented. */
 	size_t (*transmit)(void *ctx, uint8_t *buf, size_t cap);
 	int64_t (*deadline)(void *ctx); /* of the next advance; INT64_MAX: none */
 	/* The other end (a TCP client, a USB host, whoever opened the line) came or went. */
 	void (*connected)(void *ctx, bool yes, int64_t t_ns);
 	/* Serial lines: the rate at which the host's end stands now. NULL where there is none. */
 	void (*host_baud)(void *ctx, uint32_t baud);
+	/* Does it wait to hear that all it sent was taken by its reader? Then the owner says so once (played recordings are paced
+	 * by their reader). NULL: never. */
+	bool (*awaits)(const void *ctx);
+	void (*taken)(void *ctx, int64_t t_ns);
+	/* One more reader of the same device, who has to come before it gets anything (several TCP clients). False, or NULL:
+	 * there can be no more. It is destroyed before the device. */
+	bool (*session)(void *ctx, struct sim_device *ret);
 	/* False: this device has no such kind; the owner then offers it to the transport, last it is an error. */
 	bool (*fault)(void *ctx, const struct sim_fault *, bool on, int64_t t_ns);
 	const char *const *fault_kinds; /* ends with NULL */
 	void (*counts)(const void *ctx, struct sim_counts *ret);
 	void (*destroy)(void *ctx);
 };
+
+/* The brains. The scene is copied, what it points to is borrowed. 0 or -ENOMEM; ret->destroy frees. */
+int sim_lms2xx_create(const struct sim_lms2xx_params *, const struct scene *, int64_t t_ns, struct sim_device *ret);
+
+/* One of a brain's faults, as it stands: on until it is taken back, or owed so many times. */
+struct sim_fault_state {
+	bool on;
+	int owed;
+	double value; /* 0: the kind's default */
+};
+/* Index of `kind` among names that end with NULL, or -1. */
+int sim_fault_index(const char *const *kinds, const char *kind);
+/* Orders it or takes it back. */
+void sim_fault_set(struct sim_fault_state *, const struct sim_fault *, bool on);
+/* Is it due now? What is owed is paid by asking. */
+bool sim_fault_due(struct sim_fault_state *);
+double sim_fault_value(const struct sim_fault_state *, double otherwise);
+
+/* The same numbers for the same seed, on any machine (splitmix64); 0 <= sim_random < 1. */
+uint64_t sim_mix(uint64_t);
+double sim_random(uint64_t *state);
 
 #endif

@@ -24,20 +24,27 @@ struct scene {
 	void (*lost)(void *ctx, int64_t t_ns);
 };
 
-/* An LMS2xx on a pseudo-terminal. The mirror turns all the time; profiles begin at its phase. */
+/* A device's other end (struct sim_device, sim_device.h). */
+struct sim_device;
+struct sim_fault;
+
+/* An LMS2xx. The mirror turns all the time; profiles begin at its phase. */
 struct sim_lms2xx_params {
-	const char *link; /* path of the symbolic link that is made to the pty's slave */
-	bool fast;        /* drop the wire's pace (not the mirror's): bytes go as fast as they are read */
-	uint32_t baud;    /* rate the device starts with: 9600 as from the factory */
-	int mode;         /* measuring mode in its configuration (protocols A.6), e.g. 0x05: 15 bit */
+	bool fast;     /* drop the wire's pace (not the mirror's): bytes go as fast as they are read */
+	uint32_t baud; /* rate the device starts with; 0: 9600, as from the factory */
+	int mode;      /* measuring mode in its configuration (protocols A.6), e.g. 0x05: 15 bit */
 	bool millimetres;
+	bool indices; /* real-time indices are sent */
 };
-struct sim_lms2xx;
-/* NULL with one sentence in `error`. */
-struct sim_lms2xx *sim_lms2xx_create(uv_loop_t *, const struct sim_lms2xx_params *, const struct scene *,
-                                     char error[160]);
-void sim_lms2xx_destroy(struct sim_lms2xx *);     /* closes the pty, removes the link; the loop must run once more */
-void sim_lms2xx_power_cycle(struct sim_lms2xx *); /* says 90, falls back to its power-on rate and state */
+
+/* A serial device behind a pseudo-terminal: `link` becomes a symbolic link to its slave. Takes the device over, also
+ * when it fails: NULL with one sentence in `error`. */
+struct sim_pty;
+struct sim_pty *sim_pty_create(uv_loop_t *, const char *link, const struct sim_device *, char error[160]);
+void sim_pty_destroy(struct sim_pty *); /* closes the pty, removes the link; the loop must run once more */
+/* The device's faults and the line's own: "unplug". False: no such kind. */
+bool sim_pty_fault(struct sim_pty *, const struct sim_fault *, bool on);
+const char *const *sim_pty_fault_kinds(void); /* the line's own; ends with NULL */
 
 /* A servo behind Modbus (libmodbus server): really moves with a speed. Position in 0.001 degree, i32 in two registers. */
 enum sim_servo_register { /* holding registers, also readable as input registers; 32-bit values high word first */

@@ -2,8 +2,11 @@
  * snapshot is a few kilobytes a device and is written once a file. */
 #include "core/state.h"
 
+#include <assert.h>
 #include <math.h>
 #include <string.h>
+
+#define TAG_MAX 16 /* with the closing 0 */
 
 void state_save(struct state *s, void *bytes, size_t cap)
 {
@@ -105,6 +108,31 @@ void state_size(struct state *s, size_t *field, size_t max)
 	*field = (size_t)exchange_max(s, *field, max);
 }
 
+void state_time(struct state *s, int64_t *field)
+{
+	const int64_t value = (int64_t)exchange(s, (uint64_t)*field);
+
+	if (s->loading && (value < STATE_TIME_MIN || value > STATE_TIME_MAX))
+		s->failed = true;
+	if (!s->failed)
+		*field = value;
+}
+
+void state_float(struct state *s, float *field)
+{
+	uint32_t bits;
+	uint8_t raw[4];
+
+	memcpy(&bits, field, sizeof(bits));
+	for (int i = 0; i < 4; i++)
+		raw[i] = (uint8_t)(bits >> 8 * i);
+	state_bytes(s, raw, sizeof(raw));
+	bits = 0;
+	for (int i = 0; i < 4; i++)
+		bits |= (uint32_t)raw[i] << 8 * i;
+	memcpy(field, &bits, sizeof(bits));
+}
+
 void state_double(struct state *s, double *field)
 {
 	uint64_t bits;
@@ -119,18 +147,15 @@ void state_double(struct state *s, double *field)
 		*field = value;
 }
 
+/* The closing 0 is part of it, so that "clock1" is no beginning of "clock10". */
 void state_tag(struct state *s, const char *word)
 {
-	char found[16] = "";
-	const size_t len = strlen(word);
+	char found[TAG_MAX] = "";
+	const size_t len = strlen(word) + 1;
 
-	if (!s->loading) {
-		state_bytes(s, (void *)(uintptr_t)word, len);
-		return;
-	}
-	if (len >= sizeof(found))
-		s->failed = true;
-	state_bytes(s, found, s->failed ? 0 : len);
-	if (memcmp(found, word, s->failed ? 0 : len) != 0)
+	assert(len <= TAG_MAX);
+	memcpy(found, word, len);
+	state_bytes(s, found, len);
+	if (s->loading && memcmp(found, word, len) != 0)
 		s->failed = true;
 }

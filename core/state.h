@@ -18,6 +18,10 @@
 #include <stddef.h>
 #include <stdint.h>
 
+/* Times of 36 years before 1970 to 146 after: differences of two, and half as much again, are within an int64_t. */
+#define STATE_TIME_MIN (-(INT64_C(1) << 60))
+#define STATE_TIME_MAX (INT64_C(1) << 62)
+
 struct state {
 	bool loading;
 	uint8_t *bytes; /* saving: the caller's memory, cap bytes; loading: read only */
@@ -26,7 +30,7 @@ struct state {
 	bool failed;    /* loading: cut, or a value outside its bounds */
 };
 
-void state_save(struct state *, void *bytes, size_t cap);
+void state_save(struct state *, void *bytes, size_t cap); /* NULL, 0: only to learn how many bytes it takes */
 void state_load(struct state *, const void *bytes, size_t len);
 bool state_done(
     const struct state *); /* saving: all of it had room; loading: all of it was good, and nothing is left */
@@ -37,11 +41,13 @@ void state_u32(struct state *, uint32_t *);
 void state_u64(struct state *, uint64_t *);
 void state_i64(struct state *, int64_t *);
 void state_double(struct state *, double *); /* its bits; no NaN, no infinity is accepted */
+void state_float(struct state *, float *);   /* its bits, whatever they say: four bytes, for long arrays */
 void state_bool(struct state *, bool *);
 void state_int(struct state *, int *, int min, int max);
 void state_size(struct state *, size_t *, size_t max);
+void state_time(struct state *, int64_t *); /* ns, within STATE_TIME_MIN .. _MAX */
 void state_bytes(struct state *, void *, size_t len);
-/* A word that must be there when loading: the name and version of what follows, e.g. "clock1". */
+/* A word of at most 15 letters that must be there when loading: the name and version of what follows, e.g. "clock1". */
 void state_tag(struct state *, const char *word);
 
 #endif

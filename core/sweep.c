@@ -43,6 +43,7 @@
 #define CUT_M               0.5
 #define NEAR_RAD            0.02
 #define SWEEP_ROWS_MAX      2048
+#define LOST_MAX            (1u << 20) /* in a snapshot: more would be said one by one for a while */
 #define MIXED_JUMP_M        0.2f
 #define MIXED_LINE_M        0.02
 #define MIXED_RUN_SHARE     0.25f
@@ -59,6 +60,13 @@ struct fan {
 	double (*beam)[2];
 };
 
+/* Samples, each beginning with its time; number i lives at i % RING. Times rise strictly. */
+struct ring {
+	uint64_t begin, end;
+	size_t size;           /* of a sample, bytes */
+	unsigned char *sample; /* [RING], owned */
+};
+
 struct sweep {
 	struct sweep_params params;
 	struct held *held; /* ring of SWEEP_PROFILES_WAITING_MAX */
@@ -66,9 +74,7 @@ struct sweep {
 	int turn, turns; /* of the profile at the head: next row, and how many; turns 0: not judged yet */
 	uint64_t lost;   /* rows lost with profiles that found the ring full, not reported yet */
 
-	struct tilt *tilt; /* ring of RING; number i lives at i % RING */
-	struct pose *pose;
-	uint64_t tilt_begin, tilt_end, pose_begin, pose_end;
+	struct ring tilt, pose;
 
 	struct fan fan[FANS]; /* by the number of a partial scan */
 
@@ -82,16 +88,68 @@ struct sweep {
 	struct sweep_stats stats;
 };
 
+static bool ring_init(struct ring *ring, size_t size)
+{
+	*ring = (struct ring){.size = size, .sample = calloc(RING, size)};
+	return ring->sample != NULL;
+}
+
+static void *ring_at(const struct ring *ring, uint64_t i)
+{
+	return ring->sample + i % RING * ring->size;
+}
+
+static int64_t ring_time(const struct ring *ring, uint64_t i)
+{
+	int64_t t_ns;
+	memcpy(&t_ns, ring_at(ring, i), sizeof t_ns);
+	return t_ns;
+}
+
+static void ring_put(struct ring *ring, const void *sample, int64_t t_ns)
+{
+	if (ring->end > ring->begin && t_ns <= ring_time(ring, ring->end - 1)) {
+		if (ring_time(ring, ring->end - 1) - t_ns < SET_BACK_NS)
+			return;
+		ring->begin = ring->end;
+	}
+	if (ring->end - ring->begin == RING)
+		ring->begin++;
+	memcpy(ring_at(ring, ring->end++), sample, ring->size);
+}
+
+/* The number of the first sample later than t_ns. */
+static uint64_t ring_after(const struct ring *ring, int64_t t_ns)
+{
+	uint64_t low = ring->begin, high = ring->end;
+	while (low < high) {
+		uint64_t middle = low + (high - low) / 2;
+		if (ring_time(ring, middle) > t_ns)
+			high = middle;
+		else
+			low = middle + 1;
+	}
+	return low;
+}
+
+static const struct tilt *tilt_at(const struct sweep *s, uint64_t i)
+{
+	return ring_at(&s->tilt, i);
+}
+
+static const struct pose *pose_at(const struct sweep *s, uint64_t i)
+{
+	return ring_at(&s->pose, i);
+}
+
 struct sweep *sweep_create(const struct sweep_params *params)
 {
 	struct sweep *s = calloc(1, sizeof *s);
 	if (!s)
 		return NULL;
 	s->params = *params;
-	s->held = malloc(SWEEP_PROFILES_WAITING_MAX * sizeof *s->held);
-	s->tilt = malloc(RING * sizeof *s->tilt);
-	s->pose = malloc(RING * sizeof *s->pose);
-	bool good = s->held && s->tilt && s->pose;
+	s->held = calloc(SWEEP_PROFILES_WAITING_MAX, sizeof *s->held);
+	bool good = s->held && ring_init(&s->tilt, sizeof(struct tilt)) && ring_init(&s->pose, sizeof(struct pose));
 	for (int i = 0; i < FANS; i++) {
 		s->fan[i].beam = malloc(PROFILE_BEAMS_MAX * sizeof *s->fan[i].beam);
 		good &= s->fan[i].beam != NULL;
@@ -108,11 +166,24 @@ void sweep_destroy(struct sweep *s)
 	if (!s)
 		return;
 	free(s->held);
-	free(s->tilt);
-	free(s->pose);
+	free(s->tilt.sample);
+	free(s->pose.sample);
 	for (int i = 0; i < FANS; i++)
 		free(s->fan[i].beam);
 	free(s);
+}
+
+/* As it was when it was new. */
+static void sweep_clear(struct sweep *s)
+{
+	const struct sweep empty = {.params = s->params,
+	                            .held = s->held,
+	                            .tilt = {.size = s->tilt.size, .sample = s->tilt.sample},
+	                            .pose = {.size = s->pose.size, .sample = s->pose.sample}};
+	struct fan fan[FANS];
+	memcpy(fan, s->fan, sizeof fan);
+	*s = empty;
+	memcpy(s->fan, fan, sizeof fan);
 }
 
 void sweep_stats(const struct sweep *s, struct sweep_stats *ret)
@@ -163,68 +234,16 @@ void sweep_profile(struct sweep *s, const struct profile *p, int64_t log_ns)
 	held->log_ns = log_ns;
 }
 
-/* Makes room for a sample at `t_ns` in a ring whose newest is `newest_ns`; false where it is to be ignored. */
-static bool ring_admit(uint64_t *begin, uint64_t *end, int64_t newest_ns, int64_t t_ns)
-{
-	if (*end > *begin && t_ns <= newest_ns) {
-		if (newest_ns - t_ns < SET_BACK_NS)
-			return false;
-		*begin = *end;
-	}
-	if (*end - *begin == RING)
-		++*begin;
-	return true;
-}
-
-static const struct tilt *tilt_at(const struct sweep *s, uint64_t i)
-{
-	return &s->tilt[i % RING];
-}
-
-static const struct pose *pose_at(const struct sweep *s, uint64_t i)
-{
-	return &s->pose[i % RING];
-}
-
+/* A servo that says more turns than sines are known for says nothing (a float register may hold any number). */
 void sweep_tilt(struct sweep *s, const struct tilt *sample)
 {
-	int64_t newest_ns = s->tilt_end > s->tilt_begin ? tilt_at(s, s->tilt_end - 1)->t_ns : 0;
-	if (ring_admit(&s->tilt_begin, &s->tilt_end, newest_ns, sample->t_ns))
-		s->tilt[s->tilt_end++ % RING] = *sample;
+	if (fabs(sample->angle_rad) <= TRIG_ANGLE_MAX)
+		ring_put(&s->tilt, sample, sample->t_ns);
 }
 
 void sweep_pose(struct sweep *s, const struct pose *sample)
 {
-	int64_t newest_ns = s->pose_end > s->pose_begin ? pose_at(s, s->pose_end - 1)->t_ns : 0;
-	if (ring_admit(&s->pose_begin, &s->pose_end, newest_ns, sample->t_ns))
-		s->pose[s->pose_end++ % RING] = *sample;
-}
-
-/* The number of the first sample later than t_ns. */
-static uint64_t tilt_after(const struct sweep *s, int64_t t_ns)
-{
-	uint64_t low = s->tilt_begin, high = s->tilt_end;
-	while (low < high) {
-		uint64_t middle = low + (high - low) / 2;
-		if (tilt_at(s, middle)->t_ns > t_ns)
-			high = middle;
-		else
-			low = middle + 1;
-	}
-	return low;
-}
-
-static uint64_t pose_after(const struct sweep *s, int64_t t_ns)
-{
-	uint64_t low = s->pose_begin, high = s->pose_end;
-	while (low < high) {
-		uint64_t middle = low + (high - low) / 2;
-		if (pose_at(s, middle)->t_ns > t_ns)
-			high = middle;
-		else
-			low = middle + 1;
-	}
-	return low;
+	ring_put(&s->pose, sample, sample->t_ns);
 }
 
 /* Median of the newest intervals between tilt samples: neither a pause nor a burst moves it. */
@@ -232,7 +251,7 @@ static int64_t tilt_period_ns(const struct sweep *s)
 {
 	int64_t interval[PERIODS];
 	int n = 0;
-	for (uint64_t i = s->tilt_end; n < PERIODS && i > s->tilt_begin + 1; i--, n++) {
+	for (uint64_t i = s->tilt.end; n < PERIODS && i > s->tilt.begin + 1; i--, n++) {
 		int64_t value = tilt_at(s, i - 1)->t_ns - tilt_at(s, i - 2)->t_ns;
 		int k = n;
 		for (; k > 0 && interval[k - 1] > value; k--)
@@ -255,8 +274,9 @@ struct walk {
 
 static void walk_init(struct walk *w, const struct sweep *s, int64_t t_ns)
 {
-	*w = (struct walk){.s = s, .tilt_next = tilt_after(s, t_ns), .pose_next = pose_after(s, t_ns)};
-	w->tilt_limit_ns = tilt_period_ns(s) * 3 / 2;
+	*w = (struct walk){.s = s, .tilt_next = ring_after(&s->tilt, t_ns), .pose_next = ring_after(&s->pose, t_ns)};
+	int64_t period_ns = tilt_period_ns(s);
+	w->tilt_limit_ns = period_ns + period_ns / 2;
 	w->map_base = s->params.map_base;
 }
 
@@ -268,16 +288,16 @@ static int walk_tilt(struct walk *w, int64_t t_ns, double *ret_rad)
 		*ret_rad = s->params.tilt_rad;
 		return 0;
 	}
-	while (w->tilt_next < s->tilt_end && tilt_at(s, w->tilt_next)->t_ns <= t_ns)
+	while (w->tilt_next < s->tilt.end && tilt_at(s, w->tilt_next)->t_ns <= t_ns)
 		w->tilt_next++;
-	if (w->tilt_next == s->tilt_begin)
+	if (w->tilt_next == s->tilt.begin)
 		return 1 + SWEEP_NO_TILT;
 	const struct tilt *before = tilt_at(s, w->tilt_next - 1), *after;
 	if (before->t_ns == t_ns) {
 		*ret_rad = before->angle_rad;
 		return 0;
 	}
-	if (w->tilt_next == s->tilt_end) {
+	if (w->tilt_next == s->tilt.end) {
 		if (t_ns - before->t_ns > w->tilt_limit_ns)
 			return 1 + SWEEP_STALE_TILT;
 		after = before; /* go on along the last interval; there is one, or the limit were 0 */
@@ -307,8 +327,8 @@ static bool pose_equal(const struct pose *a, const struct pose *b)
 /* The last pose, moved on with the twist from an earlier one. */
 static struct transform pose_beyond(const struct sweep *s, int64_t t_ns)
 {
-	const struct pose *last = pose_at(s, s->pose_end - 1);
-	for (uint64_t i = s->pose_end - 1; i > s->pose_begin; i--) {
+	const struct pose *last = pose_at(s, s->pose.end - 1);
+	for (uint64_t i = s->pose.end - 1; i > s->pose.begin; i--) {
 		const struct pose *earlier = pose_at(s, i - 1);
 		int64_t apart_ns = last->t_ns - earlier->t_ns;
 		if (apart_ns > TWIST_OLDEST_NS)
@@ -325,12 +345,12 @@ static int walk_pose(struct walk *w, int64_t t_ns)
 	const struct sweep *s = w->s;
 	if (s->params.fixed_pose)
 		return 0;
-	while (w->pose_next < s->pose_end && pose_at(s, w->pose_next)->t_ns <= t_ns)
+	while (w->pose_next < s->pose.end && pose_at(s, w->pose_next)->t_ns <= t_ns)
 		w->pose_next++;
-	if (w->pose_next == s->pose_begin)
+	if (w->pose_next == s->pose.begin)
 		return 1 + SWEEP_NO_POSE;
 	const struct pose *before = pose_at(s, w->pose_next - 1);
-	if (w->pose_next == s->pose_end) {
+	if (w->pose_next == s->pose.end) {
 		if (t_ns - before->t_ns > POSE_EXTRAPOLATE_NS)
 			return 1 + SWEEP_STALE_POSE;
 		w->map_base = pose_beyond(s, t_ns);
@@ -418,8 +438,8 @@ static int64_t last_beam_ns(const struct profile *p)
 
 static bool samples_reach(const struct sweep *s, int64_t t_ns)
 {
-	bool tilt = s->params.fixed_tilt || (s->tilt_end > s->tilt_begin && tilt_at(s, s->tilt_end - 1)->t_ns >= t_ns);
-	bool pose = s->params.fixed_pose || (s->pose_end > s->pose_begin && pose_at(s, s->pose_end - 1)->t_ns >= t_ns);
+	bool tilt = s->params.fixed_tilt || (s->tilt.end > s->tilt.begin && tilt_at(s, s->tilt.end - 1)->t_ns >= t_ns);
+	bool pose = s->params.fixed_pose || (s->pose.end > s->pose.begin && pose_at(s, s->pose.end - 1)->t_ns >= t_ns);
 	return tilt && pose;
 }
 
@@ -428,11 +448,11 @@ static bool servo_stood(const struct sweep *s, int64_t first_ns, int64_t last_ns
 {
 	if (s->params.fixed_tilt)
 		return true;
-	uint64_t i = tilt_after(s, first_ns);
-	if (i == s->tilt_begin)
+	uint64_t i = ring_after(&s->tilt, first_ns);
+	if (i == s->tilt.begin)
 		return false;
 	double low = tilt_at(s, --i)->angle_rad, high = low;
-	for (; i < s->tilt_end; i++) {
+	for (; i < s->tilt.end; i++) {
 		double angle = tilt_at(s, i)->angle_rad;
 		low = angle < low ? angle : low;
 		high = angle > high ? angle : high;
@@ -708,6 +728,140 @@ enum sweep_verdict sweep_next(struct sweep *s, int64_t log_ns, bool end, struct 
 	row->ends_sweep = end && s->waiting == 0;
 	*ret_row = row;
 	return SWEEP_ROW;
+}
+
+/* Snapshot: what waits, the rings, the raster so far, the counters. Fans are computed again. */
+
+static void vec3_state(struct state *st, struct vec3 *v)
+{
+	state_double(st, &v->x);
+	state_double(st, &v->y);
+	state_double(st, &v->z);
+}
+
+static void held_state(struct state *st, struct held *held)
+{
+	struct profile *p = &held->profile;
+	state_time(st, &held->log_ns);
+	state_time(st, &p->t_ns);
+	state_int(st, &p->beam_ns, INT32_MIN, INT32_MAX);
+	state_int(st, &p->turn_ns, INT32_MIN, INT32_MAX);
+	state_u8(st, &p->interlace);
+	state_u8(st, &p->part);
+	state_u8(st, &p->parts);
+	state_double(st, &p->first_rad);
+	state_double(st, &p->step_rad);
+	int n = p->n;
+	state_int(st, &n, 1, PROFILE_BEAMS_MAX);
+	p->n = (uint16_t)n;
+	for (int i = 0; i < n && !st->failed; i++)
+		state_float(st, &p->range_m[i]);
+	state_bytes(st, p->state, st->failed ? 0 : (size_t)n);
+	for (int i = 0; i < n && st->loading && !st->failed; i++)
+		st->failed = p->state[i] >= BEAM_STATES;
+}
+
+/* Profiles are counted from the head on, samples from the oldest on: where they lie in their rings matters to nobody. */
+static void waiting_state(struct state *st, struct sweep *s)
+{
+	int waiting = (int)s->waiting;
+	state_int(st, &waiting, 0, SWEEP_PROFILES_WAITING_MAX);
+	s->waiting = (uint32_t)waiting;
+	for (uint32_t i = 0; i < s->waiting && !st->failed; i++)
+		held_state(st, held_at(s, i));
+	int turns_max = s->waiting > 0 && !st->failed ? interlace_of(&held_at(s, 0)->profile) : 0;
+	state_int(st, &s->turns, 0, turns_max);
+	st->failed |= st->loading && s->turns > 1 && s->turns < turns_max;
+	state_int(st, &s->turn, 0, s->turns > 0 ? s->turns - 1 : 0);
+	state_u64(st, &s->lost);
+	st->failed |= st->loading && s->lost > LOST_MAX;
+}
+
+static void tilt_state(struct state *st, void *sample)
+{
+	struct tilt *tilt = sample;
+	state_time(st, &tilt->t_ns);
+	state_double(st, &tilt->angle_rad);
+	st->failed |= st->loading && !(fabs(tilt->angle_rad) <= TRIG_ANGLE_MAX);
+}
+
+static void pose_state(struct state *st, void *sample)
+{
+	struct pose *pose = sample;
+	struct quat *q = &pose->rotation;
+	state_time(st, &pose->t_ns);
+	vec3_state(st, &pose->position_m);
+	state_double(st, &q->w);
+	state_double(st, &q->x);
+	state_double(st, &q->y);
+	state_double(st, &q->z);
+}
+
+static void ring_state(struct state *st, struct ring *ring, void (*sample_state)(struct state *, void *sample))
+{
+	size_t n = (size_t)(ring->end - ring->begin);
+	state_size(st, &n, RING);
+	if (st->loading)
+		*ring = (struct ring){0, st->failed ? 0 : n, ring->size, ring->sample};
+	for (uint64_t i = ring->begin; i < ring->end && !st->failed; i++) {
+		sample_state(st, ring_at(ring, i));
+		st->failed |= st->loading && i > ring->begin && ring_time(ring, i) <= ring_time(ring, i - 1);
+	}
+}
+
+static void raster_state(struct state *st, struct sweep *s)
+{
+	int rows = (int)s->sweep_rows;
+	state_bool(st, &s->started);
+	state_int(st, &s->direction, -1, 1);
+	state_double(st, &s->extreme_rad);
+	state_double(st, &s->last_rad);
+	vec3_state(st, &s->last_origin);
+	state_int(st, &rows, 0, SWEEP_ROWS_MAX);
+	s->sweep_rows = (uint32_t)rows;
+}
+
+static void stats_state(struct state *st, struct sweep_stats *stats)
+{
+	state_u64(st, &stats->profiles);
+	state_u64(st, &stats->rows);
+	state_u64(st, &stats->sweeps);
+	for (int i = 0; i < SWEEP_DROPS; i++)
+		state_u64(st, &stats->dropped[i]);
+	for (int i = 0; i < BEAM_STATES; i++)
+		state_u64(st, &stats->beams[i]);
+}
+
+static void fields_state(struct state *st, struct sweep *s)
+{
+	state_tag(st, "sweep1");
+	waiting_state(st, s);
+	ring_state(st, &s->tilt, tilt_state);
+	ring_state(st, &s->pose, pose_state);
+	raster_state(st, s);
+	stats_state(st, &s->stats);
+}
+
+void sweep_state(struct state *st, struct sweep *s)
+{
+	struct sweep *aside;
+	if (!st->loading) {
+		fields_state(st, s);
+		return;
+	}
+	aside = sweep_create(&s->params);
+	if (!aside) {
+		st->failed = true;
+		sweep_clear(s);
+		return;
+	}
+	fields_state(st, aside);
+	if (st->failed)
+		sweep_clear(aside);
+	struct sweep before = *s;
+	*s = *aside;
+	*aside = before;
+	sweep_destroy(aside);
 }
 
 static bool is_valid(uint8_t state)

@@ -8,6 +8,7 @@
 #ifndef FACET_CORE_SWEEP_H
 #define FACET_CORE_SWEEP_H
 
+#include "core/state.h"
 #include "core/types.h"
 
 #define SWEEP_MASKS_MAX            8
@@ -59,6 +60,8 @@ struct sweep_stats {
 	uint64_t beams[BEAM_STATES]; /* of assembled rows, by state */
 };
 void sweep_stats(const struct sweep *, struct sweep_stats *ret);
+/* Snapshot of all that later rows depend on but the parameters. A load that failed leaves the sweep as new. */
+void sweep_state(struct state *, struct sweep *);
 const char *sweep_drop_name(enum sweep_drop);
 
 /* Marks mixed beams of a row of ranges in place (interfaces, section 3): pure, shared with readers of files.

@@ -9,8 +9,6 @@
 
 #include <math.h>
 
-#define ANGLE_MAX 1.0e6 /* rad; beyond it the answer is not a number rather than a wrong one */
-
 #define HALF_PI_HIGH 0x1.921fb54000000p+0 /* 30 bits each: k * HIGH and k * MID are exact for |k| < 2^20 */
 #define HALF_PI_MID  0x1.10b4611800000p-30
 #define HALF_PI_LOW  0x1.313198a2e0370p-61
@@ -47,7 +45,7 @@ static double series_cos(double x)
 /* sin(rad + quarters * pi/2) */
 static double sine_of(double rad, int quarters)
 {
-	if (!(fabs(rad) <= ANGLE_MAX))
+	if (!(fabs(rad) <= TRIG_ANGLE_MAX))
 		return NAN;
 	double k = rint(rad * (2 / TRIG_PI));
 	double x = ((rad - k * HALF_PI_HIGH) - k * HALF_PI_MID) - k * HALF_PI_LOW;

@@ -3,8 +3,9 @@
 #ifndef FACET_CORE_TRIG_H
 #define FACET_CORE_TRIG_H
 
-#define TRIG_PI  3.14159265358979323846
-#define TRIG_DEG (TRIG_PI / 180.0)
+#define TRIG_PI        3.14159265358979323846
+#define TRIG_DEG       (TRIG_PI / 180.0)
+#define TRIG_ANGLE_MAX 1.0e6 /* rad; beyond it sine and cosine are not a number rather than a wrong one */
 
 double trig_sin(double rad);
 double trig_cos(double rad);

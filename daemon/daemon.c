@@ -444,6 +444,15 @@ static void put_status(void *ctx, struct buffer *ret)
 	control_put_status(ret, &s);
 }
 
+/* What is kept from here on gives the map that begins here. */
+static void begin_list(struct daemon *d)
+{
+	if (!d->keep.begin || journal_begin(&d->keep, d->pipeline) == 0)
+		return;
+	log_line(LOG_ERR, "out of memory: the journal ends here");
+	memset(&d->keep, 0, sizeof(d->keep));
+}
+
 static bool do_command(void *ctx, const struct control_command *command, char error[200])
 {
 	struct daemon *d = ctx;
@@ -451,10 +460,9 @@ static bool do_command(void *ctx, const struct control_command *command, char er
 	(void)error;
 	log_line(LOG_INFO, "a client asks for %s", control_name(command->word));
 	if (command->word == CONTROL_RESET) {
-		if (d->keep.reset)
-			d->keep.reset(d->keep.ctx);
 		pipeline_reset(d->pipeline);
 		worker_reset(d->worker);
+		begin_list(d);
 	} else {
 		d->paused = command->word == CONTROL_PAUSE;
 	}
@@ -628,6 +636,7 @@ static int begin(struct daemon *d, const struct daemon_options *options)
 		snprintf(d->error, 320, "out of memory; give the machine more, or set a smaller map.memory");
 		return -ENOMEM;
 	}
+	begin_list(d);
 	d->server = server_create(&d->loop, d->config, d->publisher, &host, d->error);
 	return d->server ? 0 : -EADDRINUSE;
 }

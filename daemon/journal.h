@@ -1,5 +1,5 @@
 /* The journal: what the loop handed to the pipeline, in that order (law L7). A sink of records; the daemon calls it
- * before pipeline_handle. Kept in memory by tests; a recording file comes later on the same seam. */
+ * before pipeline_handle. A recording file comes later on the same seam. */
 #ifndef FACET_DAEMON_JOURNAL_H
 #define FACET_DAEMON_JOURNAL_H
 
@@ -7,14 +7,20 @@
 
 struct journal_sink {
 	void *ctx;
+	/* The map begins (anew) here: what follows is a list of its own, which goes on from this snapshot (pipeline_state). */
+	void (*begin)(void *ctx, const void *snapshot, size_t len);
 	void (*record)(void *ctx, const struct record *);
 	void (*tick)(void *ctx, int64_t log_ns);
 	void (*not_applied)(void *ctx, uint64_t number);
-	void (*reset)(void *ctx); /* the map began anew here */
 	void (*clock)(void *ctx, int64_t ahead_ns);
 };
 
-/* A list kept in a file (tests, `facetd --journal FILE` for them): plain bytes, described in journal.c. */
+/* Says `begin` with a snapshot of the pipeline as it stands. 0 or -ENOMEM. */
+int journal_begin(const struct journal_sink *, struct pipeline *);
+
+/* Lists kept in files (tests, `facetd --journal FILE` for them): plain bytes, described in journal.c. The first list is
+ * FILE, the next, when the map began anew, FILE.2, and so on to FILE.99; after that nothing is kept. */
+#define JOURNAL_FILES_MAX 99
 struct journal;
 struct journal *journal_create(const char *path, char error[160]);
 void journal_destroy(struct journal *);
@@ -23,9 +29,8 @@ void journal_sink(struct journal *, struct journal_sink *ret);
 /* 0, or -errno of the first write that failed (the disk is full): nothing was kept from there on. */
 int journal_error(const struct journal *);
 
-/* Feeds a kept list into `pipeline` (rows not applied are skipped first). At a reset the pipeline begins anew and `reset`
- * (may be NULL) is called for the map to do so too. The input is not ended: that is pipeline_end, the caller's.
- * 0, or -EINVAL / -errno with a sentence. */
-int journal_feed(const char *path, struct pipeline *, void (*reset)(void *ctx), void *ctx, char error[160]);
+/* Feeds a kept list into a new `pipeline`: rows not applied are told first, then the snapshot, then all that came, in order.
+ * The input is not ended: that is pipeline_end, the caller's. 0, or -EINVAL / -errno with a sentence. */
+int journal_feed(const char *path, struct pipeline *, char error[160]);
 
 #endif

@@ -37,6 +37,10 @@ void pipeline_end(struct pipeline *);                     /* end of the input: h
 void pipeline_reset(
     struct pipeline *); /* a new map: rows are numbered from 0 again, the numbers to skip are forgotten */
 
+/* Snapshot of all that the rows depend on (law L7): decoders, assemblers, numbers; not the configuration, not the numbers to
+ * skip. A load that fails says why and leaves the pipeline as new; the map that belongs to it is the caller's. */
+void pipeline_state(struct pipeline *, struct state *, char error[160]);
+
 /* Within the sink's `row`: log time of the last byte of the profile that the row is made of. */
 int64_t pipeline_arrival_ns(const struct pipeline *);
 

@@ -112,7 +112,7 @@ int main(int argc, char **argv)
 	s.store = patch_store_create();
 	struct pipeline *p =
 	    pipeline_create(&s.config, &(struct pipeline_sink){.ctx = &s, .row = take_row, .flush = flush});
-	if (journal_feed(argv[2], p, NULL, NULL, error) < 0) {
+	if (journal_feed(argv[2], p, error) < 0) {
 		fprintf(stderr, "steps: %s\n", error);
 		return 1;
 	}

@@ -8,6 +8,7 @@
 #include <stdio.h>
 #include <stdlib.h>
 #include <string.h>
+#include <sys/stat.h>
 #include <unistd.h>
 
 #include <cmocka.h>
@@ -85,6 +86,16 @@ static void fake_clock(struct decoder *decoder, int64_t ahead_ns)
 	decoder->ahead_ns = ahead_ns;
 }
 
+static void fake_state(struct decoder *decoder, struct state *s)
+{
+	struct decoder aside = *decoder;
+
+	state_tag(s, "fake1");
+	state_u64(s, &aside.seen);
+	state_time(s, &aside.ahead_ns);
+	*decoder = s->failed ? (struct decoder){.device = decoder->device} : aside;
+}
+
 static void fake_counters(const struct decoder *decoder, struct decoder_counters *ret)
 {
 	ret->n = 1;
@@ -98,18 +109,21 @@ static const struct driver fakes[] = {
      .decoder_create = fake_create,
      .decoder_destroy = fake_destroy,
      .decode = fake_decode,
+     .state = fake_state,
      .counters = fake_counters},
     {.name = "tilt",
      .role = ROLE_TILT,
      .decoder_create = fake_create,
      .decoder_destroy = fake_destroy,
      .decode = fake_decode,
+     .state = fake_state,
      .counters = fake_counters},
     {.name = "pose",
      .role = ROLE_POSE,
      .decoder_create = fake_create,
      .decoder_destroy = fake_destroy,
      .decode = fake_decode,
+     .state = fake_state,
      .counters = fake_counters,
      .clock = fake_clock},
 };
@@ -159,6 +173,7 @@ struct outcome {
 	struct buffer text;
 	int refuse_from, refuse_to, rows, replies, datas; /* rows refused by their place in the list of all rows */
 	int64_t arrival_ns;
+	size_t split;     /* of the text, where the second list began */
 	int64_t ahead_ns; /* the wall clock, by which poses are dated */
 };
 
@@ -204,11 +219,6 @@ static void on_data(void *ctx, int device, int64_t t_ns)
 	(void)device;
 	(void)t_ns;
 	((struct outcome *)ctx)->datas++;
-}
-
-static void on_reset(void *ctx)
-{
-	buffer_printf(&((struct outcome *)ctx)->text, "reset\n");
 }
 
 static void open_outcome(struct outcome *o)
@@ -468,7 +478,12 @@ static void make_path(char path[64])
 	close(fd);
 }
 
-/* A live run that refuses rows and begins a new map in between. */
+static void begin_list(struct outcome *o)
+{
+	assert_int_equal(journal_begin(&o->journal, o->pipeline), 0);
+}
+
+/* A live run that refuses rows and begins a new map in mid-session: in the middle of a turn, while profiles wait. */
 static void live_run(const char *path, struct outcome *o)
 {
 	char error[160] = "";
@@ -477,41 +492,164 @@ static void live_run(const char *path, struct outcome *o)
 	assert_non_null(journal);
 	open_outcome(o);
 	journal_sink(journal, &o->journal);
+	begin_list(o);
 	o->refuse_from = 5;
 	o->refuse_to = 12;
 	play(o, 1000 * MS, 20);
 	tick(o, 3000 * MS);
-	o->journal.reset(o->journal.ctx);
+	play(o, 3500 * MS, 10);
+	give(o, LASER_A, 'L', 3633 * MS, 3631 * MS, 2);
+	give(o, LASER_B, 'L', 3634 * MS, 3632 * MS, 3);
 	pipeline_reset(o->pipeline);
-	on_reset(o);
-	o->refuse_from = 45;
-	o->refuse_to = 46;
-	play(o, 4000 * MS, 10);
+	begin_list(o);
+	o->split = o->text.len;
+	o->refuse_from = 65;
+	o->refuse_to = 66;
+	play(o, 3643 * MS, 10);
 	tick(o, 5000 * MS);
 	assert_int_equal(journal_error(journal), 0);
 	journal_destroy(journal);
 	terminate(o);
 }
 
-static void a_kept_list_gives_the_same_rows_again(void **state)
+static void second_list(const char *path, char ret[70])
 {
-	struct outcome live, again;
-	char path[64], error[160] = "";
+	snprintf(ret, 70, "%s.2", path);
+}
+
+static void expect_fed(const char *path, const uint8_t *text, size_t len)
+{
+	struct outcome again;
+	char error[160] = "";
+
+	open_outcome(&again);
+	if (journal_feed(path, again.pipeline, error) < 0)
+		fail_msg("%s", error);
+	assert_int_equal(again.text.len, len);
+	assert_memory_equal(again.text.data, text, len);
+	close_outcome(&again);
+}
+
+static void a_kept_list_gives_the_same_rows_again_also_from_mid_session_on(void **state)
+{
+	struct outcome live;
+	char path[64], second[70];
 
 	(void)state;
 	make_path(path);
+	second_list(path, second);
 	live_run(path, &live);
-	assert_int_equal(count(&live, "row "), 40 + 20 - 8);
-	assert_int_equal(count(&live, "flush"), 1);
+	assert_int_equal(count(&live, "row "), 40 + 20 - 7 + 2 + 20 - 1);
+	assert_int_equal(count(&live, "row 0 "), 2);
+	assert_int_equal(count(&live, "flush"), 2);
 	for (int round = 0; round < 2; round++) {
-		open_outcome(&again);
-		assert_int_equal(journal_feed(path, again.pipeline, on_reset, &again, error), 0);
-		terminate(&again);
-		assert_string_equal((char *)live.text.data, (char *)again.text.data);
-		close_outcome(&again);
+		expect_fed(path, live.text.data, live.split);
+		expect_fed(second, live.text.data + live.split, live.text.len - live.split);
 	}
 	unlink(path);
+	unlink(second);
 	close_outcome(&live);
+}
+
+static size_t save_pipeline(struct pipeline *pipeline, uint8_t *bytes, size_t cap)
+{
+	char error[160] = "";
+	struct state s;
+
+	state_save(&s, bytes, cap);
+	pipeline_state(pipeline, &s, error);
+	assert_string_equal(error, "");
+	return s.at;
+}
+
+/* The second list begins where the first one ends: its snapshot is what a replay of the first comes to, byte for byte. */
+static void a_snapshot_is_the_state_that_a_replay_comes_to(void **state)
+{
+	static uint8_t kept[1 << 20], fed[1 << 20];
+	struct outcome live, again;
+	char path[64], second[70], error[160] = "";
+	size_t len, kept_len;
+	FILE *file;
+
+	(void)state;
+	make_path(path);
+	second_list(path, second);
+	live_run(path, &live);
+	file = fopen(second, "r");
+	kept_len = fread(kept, 1, sizeof(kept), file);
+	fclose(file);
+	open_outcome(&again);
+	assert_int_equal(journal_feed(path, again.pipeline, error), 0);
+	pipeline_reset(again.pipeline);
+	len = save_pipeline(again.pipeline, fed, sizeof(fed));
+	assert_in_range(len, 1000, kept_len - 13);
+	assert_memory_equal(kept + 8 + 1 + 4, fed, len);
+	close_outcome(&again);
+	unlink(path);
+	unlink(second);
+	close_outcome(&live);
+}
+
+static void load_is_refused(struct pipeline *pipeline, const uint8_t *bytes, size_t len, const char *words)
+{
+	char error[160] = "";
+	struct state s;
+
+	state_load(&s, bytes, len);
+	pipeline_state(pipeline, &s, error);
+	assert_true(s.failed);
+	if (!strstr(error, words))
+		fail_msg("'%s' does not say '%s'", error, words);
+}
+
+static void a_refused_snapshot_leaves_the_pipeline_as_new(void **state)
+{
+	static uint8_t bytes[1 << 20], empty[1 << 20], after[1 << 20];
+	struct outcome live, fresh;
+	size_t len, empty_len;
+
+	(void)state;
+	open_outcome(&live);
+	play(&live, 1000 * MS, 20);
+	give(&live, LASER_A, 'L', 1300 * MS, 1300 * MS, 2);
+	len = save_pipeline(live.pipeline, bytes, sizeof(bytes));
+	open_outcome(&fresh);
+	empty_len = save_pipeline(fresh.pipeline, empty, sizeof(empty));
+	assert_true(empty_len < len);
+	for (size_t cut = 0; cut < len; cut += cut < 400 ? 1 : 13) {
+		load_is_refused(fresh.pipeline, bytes, cut, "damaged");
+		assert_int_equal(save_pipeline(fresh.pipeline, after, sizeof(after)), empty_len);
+		assert_memory_equal(after, empty, empty_len);
+	}
+	load_is_refused(fresh.pipeline, bytes, len + 1, "damaged");
+	assert_int_equal(save_pipeline(fresh.pipeline, after, sizeof(after)), empty_len);
+	close_outcome(&fresh);
+	close_outcome(&live);
+}
+
+static void a_snapshot_of_other_devices_is_refused_by_their_names(void **state)
+{
+	static uint8_t bytes[1 << 20];
+	struct outcome live, other;
+	struct config kept = config;
+	size_t len;
+
+	(void)state;
+	open_outcome(&live);
+	play(&live, 1000 * MS, 5);
+	len = save_pipeline(live.pipeline, bytes, sizeof(bytes));
+	close_outcome(&live);
+	strcpy(config.device[LASER_B].name, "front");
+	open_outcome(&other);
+	load_is_refused(other.pipeline, bytes, len,
+	                "kept with a device `b` (laser) where the configuration has `front`");
+	close_outcome(&other);
+	config = kept;
+	config.devices--;
+	open_outcome(&other);
+	load_is_refused(other.pipeline, bytes, len, "kept with 5 devices, the configuration has 4");
+	close_outcome(&other);
+	config = kept;
 }
 
 /* Three drives, the wall clock set before the second and the third. */
@@ -542,11 +680,12 @@ static void a_step_of_the_wall_clock_changes_no_row_live_or_kept(void **state)
 	journal = journal_create(path, error);
 	assert_non_null(journal);
 	journal_sink(journal, &live.journal);
+	begin_list(&live);
 	drive_through_steps(&live, steps);
 	journal_destroy(journal);
 	assert_string_equal((char *)steady.text.data, (char *)live.text.data);
 	open_outcome(&again);
-	assert_int_equal(journal_feed(path, again.pipeline, NULL, NULL, error), 0);
+	assert_int_equal(journal_feed(path, again.pipeline, error), 0);
 	terminate(&again);
 	assert_string_equal((char *)live.text.data, (char *)again.text.data);
 	unlink(path);
@@ -558,51 +697,87 @@ static void a_step_of_the_wall_clock_changes_no_row_live_or_kept(void **state)
 static void a_list_cut_anywhere_is_fed_up_to_its_last_whole_entry(void **state)
 {
 	struct outcome live, again;
-	char path[64], error[160] = "";
-	FILE *file;
-	long size;
+	char path[64], second[70], error[160] = "";
+	struct stat st;
 
 	(void)state;
 	make_path(path);
+	second_list(path, second);
 	live_run(path, &live);
-	file = fopen(path, "r");
-	fseek(file, 0, SEEK_END);
-	size = ftell(file);
-	fclose(file);
-	for (long cut = size; cut >= 8; cut -= 7) {
-		assert_int_equal(truncate(path, cut), 0);
+	assert_int_equal(stat(second, &st), 0);
+	for (long cut = st.st_size; cut >= 8; cut -= 31) {
+		assert_int_equal(truncate(second, cut), 0);
 		open_outcome(&again);
-		assert_int_equal(journal_feed(path, again.pipeline, on_reset, &again, error), 0);
+		assert_int_equal(journal_feed(second, again.pipeline, error), 0);
 		/* Rows refused at the very end may come to light again; what is whole is the same. */
-		assert_true(again.text.len <= live.text.len + 4000);
+		assert_true(again.text.len <= live.text.len - live.split + 4000);
 		close_outcome(&again);
 	}
-	assert_int_equal(truncate(path, 7), 0);
+	assert_int_equal(truncate(second, 7), 0);
 	open_outcome(&again);
-	assert_int_equal(journal_feed(path, again.pipeline, NULL, NULL, error), -EINVAL);
-	assert_non_null(strstr(error, path));
+	assert_int_equal(journal_feed(second, again.pipeline, error), -EINVAL);
+	assert_non_null(strstr(error, second));
 	close_outcome(&again);
+	unlink(second);
+	assert_int_equal(journal_feed(second, live.pipeline, error), -ENOENT);
 	unlink(path);
-	assert_int_equal(journal_feed(path, live.pipeline, NULL, NULL, error), -ENOENT);
 	close_outcome(&live);
 }
 
-static void a_list_of_other_devices_is_refused(void **state)
+static void patch_file(const char *path, long at, const void *bytes, size_t len, struct outcome *ret_fed,
+                       const char *words)
 {
-	struct outcome o;
-	char path[64], error[160] = "";
+	uint8_t before[16];
+	char error[160] = "";
+	FILE *file = fopen(path, "r+");
+
+	fseek(file, at, SEEK_SET);
+	assert_int_equal(fread(before, 1, len, file), len);
+	fseek(file, at, SEEK_SET);
+	fwrite(bytes, 1, len, file);
+	fflush(file);
+	open_outcome(ret_fed);
+	assert_int_equal(journal_feed(path, ret_fed->pipeline, error), -EINVAL);
+	assert_non_null(strstr(error, path));
+	if (!strstr(error, words))
+		fail_msg("'%s' does not say '%s'", error, words);
+	close_outcome(ret_fed);
+	fseek(file, at, SEEK_SET);
+	fwrite(before, 1, len, file);
+	fclose(file);
+}
+
+static void a_damaged_list_is_refused_with_a_sentence(void **state)
+{
+	struct outcome live, fed;
+	char path[64], second[70];
+	uint32_t snapshot = 0;
+	int64_t late_ns = INT64_MAX, early_ns = 5;
 	FILE *file;
+	long record;
 
 	(void)state;
 	make_path(path);
-	live_run(path, &o);
-	file = fopen(path, "r+");
-	fseek(file, 8 + 1 + 16, SEEK_SET);
-	fputc(99, file); /* the device of the first record */
+	second_list(path, second);
+	live_run(path, &live);
+	file = fopen(path, "r");
+	fseek(file, 9, SEEK_SET);
+	assert_int_equal(fread(&snapshot, 4, 1, file), 1);
 	fclose(file);
-	assert_int_equal(journal_feed(path, o.pipeline, NULL, NULL, error), -EINVAL);
+	record = 8 + 5 + (long)snapshot;
+	patch_file(path, 0, "FACETJ1\n", 8, &fed, "older facetd");
+	patch_file(path, 0, "#!/bin/s", 8, &fed, "no journal");
+	patch_file(path, 8, "\2", 1, &fed, "damaged");
+	patch_file(path, 8 + 5, "pipeline2", 9, &fed, "another version");
+	patch_file(path, record, "\x7f", 1, &fed, "unknown entry");
+	patch_file(path, record, "\0", 1, &fed, "unknown entry");
+	patch_file(path, record + 1 + 16, "\x63", 1, &fed, "not there"); /* the device */
+	patch_file(path, record + 1 + 17, "\3", 1, &fed, "not there");   /* the direction */
+	patch_file(path, record + 1, &late_ns, 8, &fed, "backwards");
+	patch_file(path, record + 22 + 17 + 2, &early_ns, 8, &fed, "backwards"); /* of the record after it */
 	unlink(path);
-	close_outcome(&o);
+	unlink(second);
+	close_outcome(&live);
 }
 
 static void a_journal_that_cannot_be_written_says_so(void **state)
@@ -624,10 +799,13 @@ int main(void)
 	    cmocka_unit_test(a_second_without_a_row_flushes_once),
 	    cmocka_unit_test(latency_counts_from_the_last_byte_of_the_rows_own_profile),
 	    cmocka_unit_test(replies_and_counters_are_those_of_their_device),
-	    cmocka_unit_test(a_kept_list_gives_the_same_rows_again),
+	    cmocka_unit_test(a_kept_list_gives_the_same_rows_again_also_from_mid_session_on),
+	    cmocka_unit_test(a_snapshot_is_the_state_that_a_replay_comes_to),
+	    cmocka_unit_test(a_refused_snapshot_leaves_the_pipeline_as_new),
+	    cmocka_unit_test(a_snapshot_of_other_devices_is_refused_by_their_names),
 	    cmocka_unit_test(a_step_of_the_wall_clock_changes_no_row_live_or_kept),
 	    cmocka_unit_test(a_list_cut_anywhere_is_fed_up_to_its_last_whole_entry),
-	    cmocka_unit_test(a_list_of_other_devices_is_refused),
+	    cmocka_unit_test(a_damaged_list_is_refused_with_a_sentence),
 	    cmocka_unit_test(a_journal_that_cannot_be_written_says_so),
 	};
 

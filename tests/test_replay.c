@@ -53,14 +53,6 @@ static void feed_flush(void *ctx)
 	map_flush(((struct feed *)ctx)->map);
 }
 
-static void feed_reset(void *ctx)
-{
-	struct feed *feed = ctx;
-
-	map_destroy(feed->map);
-	feed->map = new_map(&feed->config);
-}
-
 /* Meshes everything at the end: what was meshed in between must not matter. */
 static void mesh_all(struct feed *feed)
 {
@@ -92,7 +84,7 @@ static struct feed *feed_journal(const char *config_path, const char *journal_pa
 	feed->map = new_map(&feed->config);
 	feed->patches = patch_store_create();
 	feed->pipeline = pipeline_create(&feed->config, &sink);
-	if (journal_feed(journal_path, feed->pipeline, feed_reset, feed, error) < 0)
+	if (journal_feed(journal_path, feed->pipeline, error) < 0)
 		return NULL;
 	mesh_all(feed);
 	return feed;

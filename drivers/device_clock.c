@@ -144,7 +144,8 @@ static void drop_oldest(struct device_clock *c, int n)
 	memmove(c->point, c->point + n, (size_t)c->points * sizeof(c->point[0]));
 }
 
-static void add_point(struct device_clock *c, struct device_clock_point p)
+/* Did it change the points? */
+static bool add_point(struct device_clock *c, struct device_clock_point p)
 {
 	int old = 0;
 
@@ -154,13 +155,16 @@ static void add_point(struct device_clock *c, struct device_clock_point p)
 	if (c->points > 0 && interval_of(c, &c->point[c->points - 1]) == interval_of(c, &p)) {
 		if (lower(c, &p, &c->point[c->points - 1]))
 			c->point[c->points - 1] = p;
-		return;
+		else if (old == 0)
+			return false;
+		return true;
 	}
 	if (c->points == DEVICE_CLOCK_POINTS && ticks_to_ns(c, c->interval_tick) < window_ns(c) / DEVICE_CLOCK_POINTS)
 		join_pairs(c);
 	if (c->points == DEVICE_CLOCK_POINTS)
 		drop_oldest(c, 1);
 	c->point[c->points++] = p;
+	return true;
 }
 
 /* Lower convex hull of the points: their indices, left to right. Returns how many. */
@@ -280,8 +284,8 @@ static int64_t believe(struct device_clock *c, int64_t ticks, int64_t arrival_ns
 	if (ticks > c->ticks) {
 		c->ticks = ticks;
 		c->believed_ns = arrival_ns;
-		add_point(c, (struct device_clock_point){ticks, arrival_ns - ticks_to_ns(c, ticks)});
-		fit(c);
+		if (add_point(c, (struct device_clock_point){ticks, arrival_ns - ticks_to_ns(c, ticks)}))
+			fit(c);
 	}
 	return line_ns(c, ticks);
 }

@@ -24,13 +24,13 @@
 
 #include <errno.h>
 #include <stdio.h>
+#include <string.h>
 
 #ifdef HAVE_USB
 
 #include <libusb.h>
 #include <poll.h>
 #include <stdlib.h>
-#include <string.h>
 #include <sys/epoll.h>
 #include <sys/eventfd.h>
 #include <sys/timerfd.h>
@@ -209,7 +209,9 @@ static void recover(struct usb *usb)
 		return;
 	}
 	usb->halted = false;
-	if (++usb->halts > HALTS_MAX || libusb_clear_halt(usb->handle, ENDPOINT_IN) < 0)
+	if (++usb->halts > HALTS_MAX)
+		lose(usb, -EPIPE);
+	else if (libusb_clear_halt(usb->handle, ENDPOINT_IN) < 0)
 		lose(usb, -ENODEV);
 }
 
@@ -282,6 +284,21 @@ static ssize_t usb_write(struct link *link, const uint8_t *bytes, size_t len)
 static int usb_fd(const struct link *link)
 {
 	return ((const struct usb *)link)->epoll;
+}
+
+static void usb_error(const struct link *link, int error, char ret[160])
+{
+	const char *port = ((const struct usb *)link)->device.port;
+
+	if (error == ENODEV)
+		snprintf(ret, 160, "the scanner at usb:%.24s is gone: unplugged, without power, or restarted", port);
+	else if (error == ETIMEDOUT)
+		snprintf(ret, 160, "the scanner at usb:%.24s takes no requests; if that stays, plug it in anew", port);
+	else if (error == EPIPE)
+		snprintf(ret, 160, "the scanner at usb:%.24s stalls again and again; if that stays, plug it in anew",
+		         port);
+	else
+		snprintf(ret, 160, "usb:%.24s failed (%s)", port, strerror(error));
 }
 
 /* Closing: what is in flight is taken back; what a device that hangs keeps for longer than some milliseconds goes with
@@ -433,6 +450,12 @@ static struct link *usb_open(const struct config_device *config, char error[160]
 
 #else
 
+static void usb_error(const struct link *link, int error, char ret[160])
+{
+	(void)link;
+	snprintf(ret, 160, "%s", strerror(error));
+}
+
 static struct link *usb_open(const struct config_device *config, char error[160])
 {
 	snprintf(error, 160, "%.60s: facetd was built without libusb; install libusb-1.0-0-dev and build it again",
@@ -465,4 +488,4 @@ static void usb_close(struct link *link)
 
 #endif
 
-const struct cola_stream cola_usb = {usb_open, usb_fd, usb_read, usb_write, usb_close};
+const struct cola_stream cola_usb = {usb_open, usb_fd, usb_read, usb_write, usb_close, usb_error};

@@ -18,9 +18,9 @@
 #include <stddef.h>
 #include <stdint.h>
 
-/* Times of 36 years before 1970 to 146 after: differences of two, and half as much again, are within an int64_t. */
-#define STATE_TIME_MIN (-(INT64_C(1) << 60))
-#define STATE_TIME_MAX (INT64_C(1) << 62)
+/* Times from 1900 to 2093, so that sums of two, and half as much again as a difference, are within an int64_t. */
+#define STATE_TIME_MIN (-INT64_C(2200000000000000000))
+#define STATE_TIME_MAX INT64_C(3900000000000000000)
 
 struct state {
 	bool loading;

@@ -465,3 +465,11 @@ void pipeline_counters(const struct pipeline *p, int device, struct decoder_coun
 	if (p->device[device].driver->counters)
 		p->device[device].driver->counters(p->device[device].decoder, ret);
 }
+
+void pipeline_timing(const struct pipeline *p, int device, struct decoder_timing *ret)
+{
+	assert(device >= 0 && device < p->config->devices);
+	memset(ret, 0, sizeof(*ret));
+	if (p->device[device].driver->timing)
+		p->device[device].driver->timing(p->device[device].decoder, ret);
+}

@@ -51,5 +51,6 @@ struct pipeline_stats {
 void pipeline_stats(const struct pipeline *, struct pipeline_stats *ret);
 int pipeline_devices(const struct pipeline *);
 void pipeline_counters(const struct pipeline *, int device, struct decoder_counters *ret);
+void pipeline_timing(const struct pipeline *, int device, struct decoder_timing *ret); /* all 0: nothing is known */
 
 #endif

@@ -9,6 +9,8 @@
 #include <stdlib.h>
 #include <string.h>
 
+#include "drivers/jitter.h"
+
 #define RTT_KEPT    31 /* odd: the median is one of them */
 #define RTT_JUDGED  7  /* before so many are known nothing is refused */
 #define RTT_GOOD_NS 1000000
@@ -28,6 +30,7 @@ struct decoder {
 	double last_rad; /* of the answer before, a refused one too */
 	bool answered;
 	uint64_t count[COUNTERS];
+	struct jitter jitter; /* round trips: for the status, not in the snapshot */
 };
 
 static struct decoder *decoder_create(const struct config_device *device, int index)
@@ -101,6 +104,7 @@ static void decode_angle(struct decoder *d, const struct modbus_transaction *t, 
 
 	d->answered = true;
 	d->last_rad = tilt.angle_rad;
+	jitter_note(&d->jitter, rtt_ns);
 	/* When a servo that stands was read does not matter: such an answer is good however long it took. */
 	if (rtt_is_slow(d, rtt_ns) && !stands) {
 		d->count[SLOW]++;
@@ -172,6 +176,47 @@ static void counters(const struct decoder *d, struct decoder_counters *ret)
 	}
 }
 
+static void timing(const struct decoder *d, struct decoder_timing *ret)
+{
+	const int64_t period_ns =
+	    d->device.period_ns > MODBUS_PERIOD_MIN_NS ? d->device.period_ns : MODBUS_PERIOD_MIN_NS;
+
+	*ret = (struct decoder_timing){.known = d->jitter.n > 0};
+	if (d->device.period_ns > 0) /* else as fast as the answers come, and how fast they are the line decides */
+		ret->expected_hz = 1e9 / (double)period_ns;
+	jitter_percentiles(&d->jitter, &ret->jitter_p50_ns, &ret->jitter_p99_ns);
+}
+
+/* Round trips are kept oldest first: where they lie in their ring matters to nobody. */
+static void fields_state(struct decoder *d, struct state *s)
+{
+	const int oldest = d->rtt_n < RTT_KEPT ? 0 : d->rtt_next;
+
+	state_tag(s, "modbus1");
+	state_int(s, &d->rtt_n, 0, RTT_KEPT);
+	for (int i = 0; i < d->rtt_n && !s->failed; i++) {
+		state_time(s, &d->rtt_ns[(oldest + i) % RTT_KEPT]);
+		s->failed |= s->loading && (d->rtt_ns[i] <= 0 || d->rtt_ns[i] > RTT_MAX_NS);
+	}
+	d->rtt_next = s->loading ? d->rtt_n % RTT_KEPT : d->rtt_next;
+	state_double(s, &d->last_rad);
+	state_bool(s, &d->answered);
+	for (int i = 0; i < COUNTERS; i++)
+		state_u64(s, &d->count[i]);
+}
+
+static void state(struct decoder *d, struct state *s)
+{
+	struct decoder aside = {.device = d->device, .index = d->index};
+
+	if (!s->loading) {
+		fields_state(d, s);
+		return;
+	}
+	fields_state(&aside, s);
+	*d = s->failed ? (struct decoder){.device = d->device, .index = d->index} : aside;
+}
+
 const struct driver driver_modbus = {
     .name = "modbus",
     .role = ROLE_TILT,
@@ -179,6 +224,8 @@ const struct driver driver_modbus = {
     .decoder_destroy = decoder_destroy,
     .decode = decode,
     .counters = counters,
+    .timing = timing,
+    .state = state,
     .dialogue_create = modbus_dialogue_create,
     .dialogue_destroy = modbus_dialogue_destroy,
     .dialogue_reset = modbus_dialogue_reset,

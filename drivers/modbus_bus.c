@@ -36,7 +36,6 @@
 #define BYTE_US        100000
 #define CONNECT_S      1
 #define FAILURES_MAX   3
-#define PERIOD_MIN_NS  2000000 /* nobody needs more than 500 angles a second */
 #define SILENCE_MIN_NS 1750000 /* between frames above 19200 Bd */
 #define BAUD_DEFAULT   115200
 
@@ -281,7 +280,7 @@ static int poll_position(struct bus *bus)
 /* Until the bus is lost or the loop has gone. A poll that is late is not made up for: the queue never builds up. */
 static int bus_run(struct bus *bus)
 {
-	int64_t period_ns = bus->device.period_ns > PERIOD_MIN_NS ? bus->device.period_ns : PERIOD_MIN_NS;
+	int64_t period_ns = bus->device.period_ns > MODBUS_PERIOD_MIN_NS ? bus->device.period_ns : MODBUS_PERIOD_MIN_NS;
 	int64_t next_ns = monotonic_ns();
 
 	for (;;) {

@@ -6,6 +6,8 @@
 #include "drivers/driver.h"
 #include "drivers/modbus_wire.h"
 
+#define MODBUS_PERIOD_MIN_NS 2000000 /* between polls: nobody needs more than 500 angles a second */
+
 /* Kinds of `struct reply`. */
 enum modbus_reply {
 	MODBUS_ANGLE,   /* payload: one double, rad, as decoded */

@@ -19,12 +19,14 @@
 
 #include "config/address.h"
 #include "drivers/driver.h"
+#include "drivers/jitter.h"
 #include "drivers/unix_socket.h"
 
 struct decoder {
 	int index;
 	int64_t ahead_ns; /* the wall clock, of the times of records: 0 until somebody sets it */
 	uint64_t count[POSE_LINE_VERDICTS];
+	struct jitter jitter; /* of dated poses: for the status, not in the snapshot */
 };
 
 static struct decoder *decoder_create(const struct config_device *device, int index)
@@ -54,6 +56,8 @@ static void decode(struct decoder *d, const struct record *record, const struct 
 	if (verdict != POSE_LINE_OK)
 		return;
 	pose.t_ns -= d->ahead_ns;
+	if (pose.t_ns != record->t_ns)
+		jitter_note(&d->jitter, record->t_ns - pose.t_ns);
 	sink->pose(sink->ctx, d->index, &pose);
 }
 
@@ -70,6 +74,25 @@ static void counters(const struct decoder *d, struct decoder_counters *ret)
 		ret->counter[i].name = pose_line_name((enum pose_line_verdict)i);
 		ret->counter[i].count = d->count[i];
 	}
+}
+
+/* A pose without a time says nothing about how it was delayed. */
+static void timing(const struct decoder *d, struct decoder_timing *ret)
+{
+	*ret = (struct decoder_timing){.known = d->jitter.n > 0};
+	jitter_percentiles(&d->jitter, &ret->jitter_p50_ns, &ret->jitter_p99_ns);
+}
+
+static void state(struct decoder *d, struct state *s)
+{
+	struct decoder aside = *d;
+
+	state_tag(s, "pose1");
+	state_time(s, &aside.ahead_ns);
+	for (int i = 0; i < POSE_LINE_VERDICTS; i++)
+		state_u64(s, &aside.count[i]);
+	if (s->loading)
+		*d = s->failed ? (struct decoder){.index = d->index} : aside;
 }
 
 struct link {
@@ -197,6 +220,8 @@ const struct driver driver_pose = {
     .decoder_destroy = decoder_destroy,
     .decode = decode,
     .counters = counters,
+    .timing = timing,
+    .state = state,
     .clock = follow_clock,
     .link_open = link_open,
     .link_fd = link_fd,

@@ -111,7 +111,7 @@ static int64_t stamp_steady(struct clock_filter *f, int64_t arrival_ns, int64_t 
 /* A late telegram and no other behind it: arrivals are ragged by more than a period, and lateness means less. */
 static void note_raggedness(struct clock_filter *f, bool only_late)
 {
-	f->calm = only_late ? 0 : f->calm + 1;
+	f->calm = only_late ? 0 : f->calm + (f->calm <= CALM);
 	if (only_late)
 		f->patience = PATIENCE_RAGGED;
 	else if (f->calm > CALM)
@@ -173,4 +173,49 @@ int64_t clock_filter_stamp(struct clock_filter *f, int64_t arrival_ns, int turns
 	f->last_ns = stamp;
 	f->last_arrival_ns = arrival_ns;
 	return stamp;
+}
+
+/* Snapshots */
+
+static void fields(struct state *s, struct clock_filter *f)
+{
+	state_tag(s, "filter1");
+	state_i64(s, &f->period_ns);
+	state_bool(s, &f->started);
+	state_time(s, &f->last_ns);
+	state_time(s, &f->last_arrival_ns);
+	state_int(s, &f->steady, 0, STEADY);
+	state_int(s, &f->late, 0, PATIENCE_RAGGED);
+	state_int(s, &f->patience, 0, PATIENCE_RAGGED);
+	state_int(s, &f->calm, 0, CALM + 1);
+	for (int i = 0; i < CLOCK_FILTER_PHASES; i++)
+		state_i64(s, &f->phase_ns[i]);
+	state_int(s, &f->phases, 0, CLOCK_FILTER_PHASES);
+	state_int(s, &f->oldest, 0, CLOCK_FILTER_PHASES - 1);
+	state_i64(s, &f->least_ns[0]);
+	state_i64(s, &f->least_ns[1]);
+	state_int(s, &f->counted, 0, RUN);
+}
+
+/* What arithmetic goes on from: phases are parts of a period, and a least delay is one, or not known yet. */
+static bool sane(const struct clock_filter *f, int64_t period_ns)
+{
+	for (int i = 0; i < CLOCK_FILTER_PHASES; i++)
+		if (f->phase_ns[i] < 0 || f->phase_ns[i] >= period_ns)
+			return false;
+	for (int i = 0; i < 2; i++)
+		if (f->least_ns[i] < 0 || (f->least_ns[i] > GAP_NS && f->least_ns[i] < INT64_MAX - GAP_NS))
+			return false;
+	return f->period_ns == period_ns && (f->phases > 0 || !f->started);
+}
+
+void clock_filter_state(struct state *s, struct clock_filter *f)
+{
+	struct clock_filter aside = *f;
+
+	fields(s, &aside);
+	if (s->loading && !s->failed && !sane(&aside, f->period_ns))
+		s->failed = true;
+	if (s->loading && !s->failed)
+		*f = aside;
 }

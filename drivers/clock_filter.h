@@ -6,6 +6,8 @@
 #include <stdbool.h>
 #include <stdint.h>
 
+#include "core/state.h"
+
 #define CLOCK_FILTER_PHASES 8
 
 struct clock_filter {
@@ -32,5 +34,7 @@ void clock_filter_init(struct clock_filter *, int64_t period_ns);
  * yet); `turns` periods or more apart, less what a telegram that was quicker than all before it shows of their delay.
  * Starts anew after a gap of 2 s. */
 int64_t clock_filter_stamp(struct clock_filter *, int64_t arrival_ns, int turns);
+
+void clock_filter_state(struct state *, struct clock_filter *); /* a load that failed changes nothing */
 
 #endif

@@ -22,7 +22,6 @@
 
 #include <assert.h>
 #include <math.h>
-#include <stdlib.h>
 #include <string.h>
 
 #define MS             1000000ll
@@ -329,14 +328,12 @@ int64_t device_clock_stamp(struct device_clock *c, uint32_t tick, int64_t arriva
 		return c->answered_ns;
 	if (t_ns > arrived_ns)
 		t_ns = arrived_ns;
-	if (c->arrival_ns <= arrived_ns && t_ns <= c->answered_ns && c->delays > 0)
+	if (c->arrival_ns <= arrived_ns && t_ns <= c->answered_ns && c->answers)
 		t_ns = c->answered_ns + 1;
-	const int64_t delay_us = (arrived_ns - t_ns) / 1000;
-	c->delay_us[c->delays++ % DEVICE_CLOCK_DELAYS] = delay_us < 0            ? 0
-	                                                 : delay_us > UINT32_MAX ? UINT32_MAX
-	                                                                         : (uint32_t)delay_us;
+	jitter_note(&c->jitter, arrived_ns - t_ns);
 	c->answered = tick;
 	c->answered_ns = t_ns;
+	c->answers = true;
 	c->arrival_ns = arrived_ns;
 	c->offset_ns = t_ns - ticks_to_ns(c, c->doubted ? c->doubt_ticks : c->ticks);
 	return t_ns;
@@ -353,32 +350,9 @@ int64_t device_clock_at(const struct device_clock *c, uint32_t tick)
 	return c->answered_ns + (int64_t)rint(since_ns + c->slope * since_ns);
 }
 
-/* What is said of it ---------------------------------------------------------------------------------------------- */
-
-static int compare_delays(const void *a, const void *b)
-{
-	const uint32_t x = *(const uint32_t *)a, y = *(const uint32_t *)b;
-
-	return x < y ? -1 : x > y;
-}
-
-static int delays_kept(const struct device_clock *c)
-{
-	return c->delays < DEVICE_CLOCK_DELAYS ? (int)c->delays : DEVICE_CLOCK_DELAYS;
-}
-
 void device_clock_jitter(const struct device_clock *c, int64_t *ret_p50_ns, int64_t *ret_p99_ns)
 {
-	uint32_t sorted[DEVICE_CLOCK_DELAYS];
-	const int n = delays_kept(c);
-
-	*ret_p50_ns = *ret_p99_ns = 0;
-	if (n == 0)
-		return;
-	memcpy(sorted, c->delay_us, (size_t)n * sizeof(sorted[0]));
-	qsort(sorted, (size_t)n, sizeof(sorted[0]), compare_delays);
-	*ret_p50_ns = (int64_t)sorted[n / 2] * 1000;
-	*ret_p99_ns = (int64_t)sorted[n * 99 / 100] * 1000;
+	jitter_percentiles(&c->jitter, ret_p50_ns, ret_p99_ns);
 }
 
 /* Snapshots ------------------------------------------------------------------------------------------------------- */
@@ -444,6 +418,7 @@ static void fields(struct state *s, struct device_clock *c)
 	state_i64(s, &c->arrival_ns);
 	state_u32(s, &c->answered);
 	state_i64(s, &c->answered_ns);
+	state_bool(s, &c->answers);
 	state_i64(s, &c->interval_tick);
 	state_int(s, &c->points, 0, DEVICE_CLOCK_POINTS);
 	for (int i = 0; i < c->points; i++) {
@@ -463,9 +438,6 @@ static void fields(struct state *s, struct device_clock *c)
 	state_i64(s, &c->offset_ns);
 	state_double(s, &c->drift);
 	state_int(s, &c->restarts, 0, 1000000000);
-	state_u64(s, &c->delays);
-	for (int i = 0; i < delays_kept(c) && !s->failed; i++)
-		state_u32(s, &c->delay_us[i]);
 }
 
 void device_clock_state(struct state *s, struct device_clock *c)

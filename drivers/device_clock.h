@@ -15,9 +15,9 @@
 #include <stdint.h>
 
 #include "core/state.h"
+#include "drivers/jitter.h"
 
-#define DEVICE_CLOCK_POINTS 64   /* of the envelope */
-#define DEVICE_CLOCK_DELAYS 1024 /* the newest, for the percentiles of jitter */
+#define DEVICE_CLOCK_POINTS 64 /* of the envelope */
 
 struct device_clock {
 	/* What kind of clock it is. */
@@ -32,6 +32,7 @@ struct device_clock {
 	int64_t arrival_ns;    /* of the newest */
 	uint32_t answered;     /* the newest, as read ... */
 	int64_t answered_ns;   /* ... and what was answered */
+	bool answers;          /* anything was, ever */
 	int64_t interval_tick; /* every so many ticks have one point, the least delayed */
 	/* Points of the envelope, oldest first. */
 	struct device_clock_point {
@@ -45,11 +46,10 @@ struct device_clock {
 	int64_t doubt_since_ns, doubt_run_ns, doubt_ns;
 	int64_t doubt_ticks, doubt_least_ns, doubt_most_ns;
 
-	int64_t offset_ns;                      /* log time - device time, at `ticks` */
-	double drift;                           /* device ns per host ns - 1 */
-	int restarts;                           /* steps of the device's time */
-	uint32_t delay_us[DEVICE_CLOCK_DELAYS]; /* ring: arrivals behind the envelope */
-	uint64_t delays;
+	int64_t offset_ns;    /* log time - device time, at `ticks` */
+	double drift;         /* device ns per host ns - 1 */
+	int restarts;         /* steps of the device's time */
+	struct jitter jitter; /* arrivals behind the envelope: for the status, not in the snapshot */
 };
 
 /* tick_ns 1 .. 1e9, wrap 2 .. 2^32 (together 1e18 ns at most), drift_max up to 0.1. */

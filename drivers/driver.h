@@ -49,7 +49,7 @@ struct record_sink {
 };
 
 /* Verdicts of a decoder, by reason: counted, never logged per event. Names say the reason. */
-#define DECODER_COUNTERS_MAX 16
+#define DECODER_COUNTERS_MAX 20
 struct decoder_counters {
 	int n;
 	struct {

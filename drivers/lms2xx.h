@@ -8,6 +8,8 @@ struct decoder *lms2xx_decoder_create(const struct config_device *, int device);
 void lms2xx_decoder_destroy(struct decoder *);
 void lms2xx_decode(struct decoder *, const struct record *, const struct record_sink *);
 void lms2xx_counters(const struct decoder *, struct decoder_counters *ret);
+void lms2xx_timing(const struct decoder *, struct decoder_timing *ret);
+void lms2xx_decoder_state(struct decoder *, struct state *);
 
 struct dialogue *lms2xx_dialogue_create(const struct config *, int device);
 void lms2xx_dialogue_destroy(struct dialogue *);

@@ -7,19 +7,29 @@
  *
  * Times. The scanner sends a scan when its last beam is measured; the read that delivers the last byte comes a telegram
  * later (bytes * 10 / baud), and whatever the host added. So
- *     end of scan = clock filter(last byte - transfer),   first beam = end - (turns - 1) * 13.3 ms - fov * 37.04 us.
+ *     end of scan = clock(last byte - transfer),   first beam = end - (turns - 1) * 13.3 ms - fov * 37.04 us - latency.
  * A scan of 0.5 (0.25) degree is 2 (4) turns of the mirror interlaced, each measuring every second (fourth) beam in
  * this order: struct profile says so and every beam gets its time from there. What the scanner adds itself (it is not
- * published) is a constant for calibration. The rate is learned from the request that sets it. */
+ * published) is a constant for calibration, `latency`. The rate is learned from the request that sets it.
+ *
+ * Which clock: where real-time indices follow the values, the scan index counts every scan that the mirror made, also
+ * those that a slow line skipped or lost, so the index is the time and a device clock follows it. Where they are off, and
+ * for partial scans (what the index counts there is not documented), arrivals are fitted to the mirror's period. */
 #include "drivers/lms2xx.h"
 
 #include <stdlib.h>
+#include <string.h>
 
 #include "core/trig.h"
 #include "drivers/clock_filter.h"
+#include "drivers/device_clock.h"
+#include "drivers/jitter.h"
 #include "drivers/lms2xx_wire.h"
 
-#define LINE_BYTES 4096 /* more than the longest telegram */
+#define LINE_BYTES   4096 /* more than the longest telegram */
+#define TURN_NS      (40e6 / 3)
+#define INDEX_WRAP   256
+#define MIRROR_DRIFT 0.01 /* a motor: far from what any was seen to do */
 
 enum counter {
 	TELEGRAMS,
@@ -37,6 +47,7 @@ enum counter {
 	NOT_ACKNOWLEDGED,
 	REJECTED,
 	SCANS_SKIPPED,
+	TELEGRAMS_LOST,
 	DEVICE_ERRORS,
 	COUNTERS
 };
@@ -44,19 +55,24 @@ enum counter {
 static const char *const counter_names[COUNTERS] = {
     "telegrams", "profiles",         "crc",           "garbage bytes",       "too long",       "bad size",
     "cut",       "unknown telegram", "mode unknown",  "mode without ranges", "raster unknown", "malformed",
-    "nak",       "rejected",         "scans skipped", "device errors"};
+    "nak",       "rejected",         "scans skipped", "telegrams lost",      "device errors"};
 _Static_assert(COUNTERS <= DECODER_COUNTERS_MAX, "the counters of a decoder have a limit");
 
 struct decoder {
 	int device;
-	uint32_t baud;
+	uint32_t configured_baud, baud;
 	uint8_t asked_mode; /* second byte of the last mode request: a rate counts when it is answered */
 	bool mode_known;
 	int mode;                     /* measuring mode */
 	int fov_deg, resolution_cdeg; /* variant last answered; 0: not known */
 	bool index_known;
-	uint8_t index; /* of the last scan that had one */
-	struct clock_filter clock;
+	uint8_t scan_index, telegram_index; /* of the last scan that had them */
+	bool counts;                        /* `mirror` dates the scans, else `filter` */
+	struct clock_filter filter;
+	struct device_clock mirror;
+	double expected_hz;   /* by raster and rate; 0: nothing came yet */
+	struct jitter jitter; /* of the filter: for the status, not in the snapshot */
+	int64_t latency_ns;
 	int64_t heard_ns[2]; /* last bytes of a direction */
 	struct framer framer[2];
 	uint8_t bytes[2][LINE_BYTES];
@@ -64,16 +80,37 @@ struct decoder {
 	struct profile profile;
 };
 
+static void clocks_init(struct decoder *d)
+{
+	d->index_known = d->counts = false;
+	d->expected_hz = 0;
+	clock_filter_init(&d->filter, LMS2XX_TURN_NS);
+	device_clock_init(&d->mirror, TURN_NS, INDEX_WRAP, MIRROR_DRIFT);
+}
+
+/* As new. */
+static void start(struct decoder *d, uint32_t baud)
+{
+	const int device = d->device;
+	const int64_t latency_ns = d->latency_ns;
+
+	memset(d, 0, sizeof *d);
+	d->device = device;
+	d->latency_ns = latency_ns;
+	d->configured_baud = d->baud = baud;
+	clocks_init(d);
+	framer_init(&d->framer[FROM_DEVICE], lms2xx_scan_device, NULL, d->bytes[FROM_DEVICE], LINE_BYTES);
+	framer_init(&d->framer[TO_DEVICE], lms2xx_scan_host, NULL, d->bytes[TO_DEVICE], LINE_BYTES);
+}
+
 struct decoder *lms2xx_decoder_create(const struct config_device *config, int device)
 {
 	struct decoder *d = calloc(1, sizeof *d);
 	if (d == NULL)
 		return NULL;
 	d->device = device;
-	d->baud = config->baud;
-	clock_filter_init(&d->clock, LMS2XX_TURN_NS);
-	framer_init(&d->framer[FROM_DEVICE], lms2xx_scan_device, NULL, d->bytes[FROM_DEVICE], LINE_BYTES);
-	framer_init(&d->framer[TO_DEVICE], lms2xx_scan_host, NULL, d->bytes[TO_DEVICE], LINE_BYTES);
+	d->latency_ns = config->latency_ns;
+	start(d, config->baud);
 	return d;
 }
 
@@ -178,24 +215,61 @@ static void fill_profile(struct decoder *d, const struct lms2xx_scan *scan, cons
 	}
 }
 
-/* Time of the first beam of the profile, from the arrival of its telegram's last byte. */
-static int64_t first_beam(struct decoder *d, const struct raster *raster, size_t telegram_len, int64_t arrival_ns)
+/* Scans a second that the line lets through: while one is on its way, those that end are skipped. */
+static double expected_hz(const struct raster *raster, int64_t transfer_ns)
 {
-	const int64_t transfer_ns = d->baud > 0 ? (int64_t)telegram_len * 10 * 1000000000 / d->baud : 0;
-	const int64_t end_ns = clock_filter_stamp(&d->clock, arrival_ns - transfer_ns, raster->interlace);
-	const int64_t start_ns =
-	    end_ns - (raster->interlace - 1) * (int64_t)LMS2XX_TURN_NS - raster->fov_deg * LMS2XX_BEAM_NS;
-	return start_ns + (raster->first + raster->skip) / raster->interlace * (int64_t)d->profile.beam_ns;
+	const double scan_ns = raster->interlace * TURN_NS;
+	const int64_t scans = 1 + (int64_t)((double)transfer_ns / scan_ns);
+
+	return 1e9 / (scan_ns * (double)scans);
 }
 
-/* Real-time indices count the scans that the mirror made: what lies between two telegrams was skipped on a slow line.
- */
-static void follow_index(struct decoder *d, const struct lms2xx_scan *scan)
+/* When the last beam of the scan was measured. */
+static int64_t end_of_scan(struct decoder *d, const struct lms2xx_scan *scan, const struct raster *raster,
+                           int64_t sent_ns)
 {
-	if (scan->indexed && d->index_known)
-		d->count[SCANS_SKIPPED] += (uint8_t)(scan->scan_index - d->index - 1);
+	const double scan_ns = raster->interlace * TURN_NS;
+
+	d->counts = scan->indexed && !scan->partial;
+	if (!d->counts) {
+		const int64_t end_ns = clock_filter_stamp(&d->filter, sent_ns, raster->interlace);
+
+		jitter_note(&d->jitter, sent_ns - end_ns);
+		return end_ns;
+	}
+	if (d->mirror.tick_ns < scan_ns || d->mirror.tick_ns > scan_ns) /* another variant */
+		device_clock_init(&d->mirror, scan_ns, INDEX_WRAP, MIRROR_DRIFT);
+	return device_clock_stamp(&d->mirror, scan->scan_index, sent_ns);
+}
+
+/* Time of the first beam of the profile, from the arrival of its telegram's last byte. */
+static int64_t first_beam(struct decoder *d, const struct lms2xx_scan *scan, const struct raster *raster,
+                          size_t telegram_len, int64_t arrival_ns)
+{
+	const int64_t transfer_ns = d->baud > 0 ? (int64_t)telegram_len * 10 * 1000000000 / d->baud : 0;
+	const int64_t end_ns = end_of_scan(d, scan, raster, arrival_ns - transfer_ns);
+	const int64_t start_ns =
+	    end_ns - (raster->interlace - 1) * (int64_t)LMS2XX_TURN_NS - raster->fov_deg * LMS2XX_BEAM_NS;
+
+	d->expected_hz = expected_hz(raster, transfer_ns);
+	return start_ns + (raster->first + raster->skip) / raster->interlace * (int64_t)d->profile.beam_ns -
+	       d->latency_ns;
+}
+
+/* Real-time indices count the scans that the mirror made and the telegrams that left: what the line lost is missing in
+ * both, what the scanner skipped because the line was busy in the first alone. */
+static void follow_indices(struct decoder *d, const struct lms2xx_scan *scan)
+{
+	if (scan->indexed && d->index_known) {
+		const uint8_t scans = (uint8_t)(scan->scan_index - d->scan_index - 1);
+		const uint8_t lost = (uint8_t)(scan->telegram_index - d->telegram_index - 1);
+
+		d->count[TELEGRAMS_LOST] += lost;
+		d->count[SCANS_SKIPPED] += scans > lost ? (uint64_t)(scans - lost) : 0;
+	}
 	d->index_known = scan->indexed;
-	d->index = scan->scan_index;
+	d->scan_index = scan->scan_index;
+	d->telegram_index = scan->telegram_index;
 }
 
 static void take_scan(struct decoder *d, const uint8_t *payload, size_t len, int64_t t_ns,
@@ -208,7 +282,7 @@ static void take_scan(struct decoder *d, const uint8_t *payload, size_t len, int
 		d->count[MALFORMED]++;
 		return;
 	}
-	follow_index(d, &scan);
+	follow_indices(d, &scan);
 	if ((scan.status & 7) >= 3)
 		d->count[DEVICE_ERRORS]++;
 	if (scan.command != LMS2XX_SCAN && scan.command != LMS2XX_SCAN_RANGE &&
@@ -229,7 +303,7 @@ static void take_scan(struct decoder *d, const uint8_t *payload, size_t len, int
 		return;
 	}
 	fill_profile(d, &scan, &raster, lms2xx_unit_m(scan.unit));
-	d->profile.t_ns = first_beam(d, &raster, len + 6, t_ns);
+	d->profile.t_ns = first_beam(d, &scan, &raster, len + 6, t_ns);
 	d->count[PROFILES]++;
 	sink->profile(sink->ctx, d->device, &d->profile);
 }
@@ -253,7 +327,7 @@ static void learn_baud(struct decoder *d, const uint8_t *payload)
 	const uint32_t baud = lms2xx_mode_baud(d->asked_mode);
 	if (baud != 0 && payload[1] == 0 && baud != d->baud) {
 		d->baud = baud;
-		clock_filter_init(&d->clock, LMS2XX_TURN_NS);
+		clocks_init(d);
 	}
 	d->asked_mode = 0;
 }
@@ -263,8 +337,7 @@ static void forget(struct decoder *d)
 {
 	d->mode_known = false;
 	d->fov_deg = d->resolution_cdeg = 0;
-	d->index_known = false;
-	clock_filter_init(&d->clock, LMS2XX_TURN_NS);
+	clocks_init(d);
 }
 
 static void take_telegram(struct decoder *d, const uint8_t *payload, size_t len, int64_t t_ns,
@@ -353,6 +426,7 @@ void lms2xx_decode(struct decoder *d, const struct record *record, const struct 
 	if (record->direction == LINK_OPENED) {
 		framer_restart(&d->framer[FROM_DEVICE]);
 		framer_restart(&d->framer[TO_DEVICE]);
+		clocks_init(d);
 		return;
 	}
 	if (record->t_ns - d->heard_ns[direction] > LMS2XX_STALE_NS)
@@ -362,4 +436,53 @@ void lms2xx_decode(struct decoder *d, const struct record *record, const struct 
 		done += framer_push(framer, record->bytes + done, record->len - done);
 		drain(d, direction, record->t_ns, sink);
 	}
+}
+
+/* How well it keeps time. Without indices nobody knows what was lost, nor the mirror's own time. */
+void lms2xx_timing(const struct decoder *d, struct decoder_timing *ret)
+{
+	*ret = (struct decoder_timing){
+	    .known = d->expected_hz > 0, .expected_hz = d->expected_hz, .lost = d->count[TELEGRAMS_LOST]};
+	if (!d->counts) {
+		jitter_percentiles(&d->jitter, &ret->jitter_p50_ns, &ret->jitter_p99_ns);
+		return;
+	}
+	ret->stamps = true;
+	ret->offset_ns = d->mirror.offset_ns;
+	ret->drift_ppm = d->mirror.drift * 1e6;
+	device_clock_jitter(&d->mirror, &ret->jitter_p50_ns, &ret->jitter_p99_ns);
+}
+
+static void fields(struct decoder *d, struct state *s)
+{
+	state_tag(s, "lms2xx1");
+	state_u32(s, &d->baud);
+	state_u8(s, &d->asked_mode);
+	state_bool(s, &d->mode_known);
+	state_int(s, &d->mode, 0, UINT8_MAX);
+	state_int(s, &d->fov_deg, 0, UINT16_MAX);
+	state_int(s, &d->resolution_cdeg, 0, UINT16_MAX);
+	state_bool(s, &d->index_known);
+	state_u8(s, &d->scan_index);
+	state_u8(s, &d->telegram_index);
+	state_bool(s, &d->counts);
+	state_double(s, &d->expected_hz);
+	clock_filter_state(s, &d->filter);
+	device_clock_state(s, &d->mirror);
+	for (int i = 0; i < 2; i++) {
+		state_time(s, &d->heard_ns[i]);
+		framer_state(s, &d->framer[i]);
+	}
+	for (int i = 0; i < COUNTERS; i++)
+		state_u64(s, &d->count[i]);
+}
+
+/* What lies in the scan's scratch is written anew by every scan. */
+void lms2xx_decoder_state(struct decoder *d, struct state *s)
+{
+	if (s->loading)
+		start(d, d->configured_baud);
+	fields(d, s);
+	if (s->loading && s->failed)
+		start(d, d->configured_baud);
 }

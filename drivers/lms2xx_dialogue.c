@@ -99,7 +99,7 @@ struct dialogue {
 	bool variant_fits;
 	struct lms2xx_config config; /* to be written */
 	int64_t heard_ns;            /* last valid telegram */
-	const char *why; /* everything begins anew, NULL: it is the first time */
+	const char *why;             /* everything begins anew, NULL: it is the first time */
 	char error[160];
 };
 

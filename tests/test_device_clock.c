@@ -418,7 +418,7 @@ static void a_snapshot_goes_on_with_the_same_bits(void **state)
 			hear(&d, draw_ns(&d, LMS111)), hear(&e, draw_ns(&e, LMS111));
 			assert_int_equal(d.answer_ns, e.answer_ns);
 		}
-		assert_memory_equal(&d.clock, &e.clock, sizeof(d.clock));
+		assert_memory_equal(&d.clock, &e.clock, offsetof(struct device_clock, jitter));
 		done(&d);
 		done(&e);
 	}

@@ -409,19 +409,213 @@ static void sub_ranges_need_the_variant_and_begin_with_the_first_turn(void **sta
 	assert_int_equal(count(rig, "raster unknown"), 3);
 }
 
-static void indices_tell_how_many_scans_the_line_skipped(void **state)
+static void indices_tell_what_was_skipped_and_what_was_lost(void **state)
 {
 	struct rig *rig = *state;
 	struct lms2xx_scan scan = {.n = 181, .unit = LMS2XX_MM, .indexed = true, .status = 0x10};
+	struct decoder_timing timing;
 	tell_mode(rig, 0x05);
 	for (int i = 0; i < 100; i++) {
 		scan.scan_index = (uint8_t)(i * 8);
 		scan.telegram_index = (uint8_t)i;
-		rig->t_ns += 107 * MS;
-		feed_scan(rig, scan);
+		rig->t_ns += 320 * MS / 3;
+		if (i % 10 != 5) /* every tenth is lost on its way */
+			feed_scan(rig, scan);
 	}
-	assert_int_equal(rig->profiles, 100);
+	assert_int_equal(rig->profiles, 90);
 	assert_int_equal(count(rig, "scans skipped"), 99 * 7);
+	assert_int_equal(count(rig, "telegrams lost"), 10);
+	driver_lms2xx.timing(rig->decoder, &timing);
+	assert_true(timing.known && timing.stamps);
+	assert_int_equal(timing.lost, 10);
+	assert_true(timing.drift_ppm > -100 && timing.drift_ppm < 100);
+}
+
+/* Index and arrival of scan k of a mirror that runs 1 % of a turn a second slow; delays are below 2 ms. */
+static int64_t mirror_ns(int k)
+{
+	return 1000 * MS + (int64_t)(k * 26666666.667 * 1.00013);
+}
+
+static void send_indexed(struct rig *rig, int k, int telegram, int64_t delay_ns)
+{
+	rig->t_ns = mirror_ns(k) + 372 * 20000 + 361 * 20000 + 3 * MS + delay_ns;
+	feed_scan(rig, (struct lms2xx_scan){.n = 361,
+	                                    .unit = LMS2XX_MM,
+	                                    .indexed = true,
+	                                    .scan_index = (uint8_t)k,
+	                                    .telegram_index = (uint8_t)telegram,
+	                                    .status = 0x10});
+}
+
+/* Without an index a late telegram and a lost one look alike at first; with it there is nothing to guess. */
+static void with_indices_a_lost_telegram_misplaces_nothing(void **state)
+{
+	struct rig *rig = *state;
+	int64_t first_ns = 0, worst_ns = 0;
+	uint64_t lost = 0;
+	tell_mode(rig, 0x05);
+	for (int k = 0; k < 4000; k++) {
+		if (k % 50 == 49 || (k > 2000 && k < 2060)) {
+			lost++;
+			continue;
+		}
+		const int before = rig->profiles;
+		send_indexed(rig, k, k, k % 7 == 0 ? 0 : k % 13 * MS / 7);
+		assert_int_equal(rig->profiles, before + 1);
+		const int64_t error_ns = rig->last.t_ns - mirror_ns(k);
+		if (k == 400)
+			first_ns = error_ns;
+		if (k > 400 && llabs(error_ns - first_ns) > worst_ns)
+			worst_ns = llabs(error_ns - first_ns);
+	}
+	assert_true(worst_ns < 100000);
+	assert_int_equal(count(rig, "telegrams lost"), lost - 1); /* nobody can know of the last */
+	assert_int_equal(count(rig, "scans skipped"), 0);
+}
+
+static void partial_scans_are_dated_by_their_arrival_whatever_the_index(void **state)
+{
+	struct rig *rig = *state;
+	int64_t before_ns = 0;
+	tell_mode(rig, 0x05);
+	for (int i = 0; i < 400; i++) {
+		const uint8_t part = i & 3;
+		rig->t_ns = 1000 * MS + i * 40 * MS / 3;
+		feed_scan(rig, (struct lms2xx_scan){.n = part ? 180 : 181,
+		                                    .unit = LMS2XX_MM,
+		                                    .partial = true,
+		                                    .part = part,
+		                                    .indexed = true,
+		                                    .scan_index = (uint8_t)(i / 4),
+		                                    .telegram_index = (uint8_t)i,
+		                                    .status = 0x10});
+		assert_true(i == 0 || llabs(rig->last.t_ns - before_ns - 40 * MS / 3) < MS / 10);
+		before_ns = rig->last.t_ns;
+	}
+}
+
+static void latency_moves_every_beam(void **state)
+{
+	struct rig *rig = *state;
+	static const struct config_device config = {.baud = 500000, .latency_ns = 2500000};
+	tell_mode(rig, 0x05);
+	feed(rig, FROM_DEVICE, rig->real, rig->real_len);
+	const int64_t without_ns = rig->last.t_ns;
+	driver_lms2xx.decoder_destroy(rig->decoder);
+	rig->decoder = driver_lms2xx.decoder_create(&config, 3);
+	tell_mode(rig, 0x05);
+	feed(rig, FROM_DEVICE, rig->real, rig->real_len);
+	assert_int_equal(rig->last.t_ns, without_ns - 2500000);
+}
+
+static void the_expected_rate_is_what_the_line_lets_through(void **state)
+{
+	struct rig *rig = *state;
+	struct decoder_timing timing;
+	static const struct {
+		uint32_t baud;
+		uint16_t n;
+		double hz; /* protocols, A.9; 38400 with 361 values: 4.7 seen */
+	} rates[] = {{500000, 181, 75},      {500000, 361, 37.5},    {500000, 401, 18.75}, {38400, 181, 75 / 8.0},
+	             {38400, 361, 37.5 / 8}, {9600, 361, 37.5 / 29}, {9600, 181, 2.5}};
+	driver_lms2xx.timing(rig->decoder, &timing);
+	assert_false(timing.known);
+	for (int i = 0; i < 7; i++) {
+		const struct config_device config = {.baud = rates[i].baud};
+		driver_lms2xx.decoder_destroy(rig->decoder);
+		rig->decoder = driver_lms2xx.decoder_create(&config, 3);
+		tell_mode(rig, 0x05);
+		feed_scan(rig, (struct lms2xx_scan){.n = rates[i].n, .unit = LMS2XX_MM, .status = 0x10});
+		driver_lms2xx.timing(rig->decoder, &timing);
+		assert_true(timing.known && !timing.stamps);
+		assert_float_equal(timing.expected_hz, rates[i].hz, 0.01);
+	}
+}
+
+static size_t save(struct rig *rig, uint8_t *ret, size_t cap)
+{
+	struct state s;
+	state_save(&s, ret, cap);
+	driver_lms2xx.state(rig->decoder, &s);
+	assert_true(state_done(&s));
+	return s.at;
+}
+
+static bool load(struct rig *rig, const uint8_t *bytes, size_t len)
+{
+	struct state s;
+	state_load(&s, bytes, len);
+	driver_lms2xx.state(rig->decoder, &s);
+	return state_done(&s);
+}
+
+/* The telegrams of a session, each read in two pieces, the second with the first of the next: a snapshot stands within. */
+static uint64_t session(struct rig *rig, int from, int to, bool indexed)
+{
+	uint64_t seen = 0;
+	uint8_t bytes[2 * LMS2XX_TELEGRAM_MAX];
+	for (int i = from; i < to; i++) {
+		const struct lms2xx_scan scan = {.n = 361, .unit = LMS2XX_MM, .indexed = indexed, .status = 0x10};
+		struct lms2xx_scan one = scan, next = scan;
+		one.scan_index = (uint8_t)(i + i / 5);
+		one.telegram_index = (uint8_t)i;
+		next.scan_index = (uint8_t)(i + 1 + (i + 1) / 5);
+		next.telegram_index = (uint8_t)(i + 1);
+		const size_t len = make_scan(bytes, one);
+		make_scan(bytes + len, next);
+		const int before = rig->profiles;
+		rig->t_ns = 1000 * MS + (i + i / 5) * 80 * MS / 3 + i * 7919 % 3 * MS;
+		feed(rig, FROM_DEVICE, i == 0 ? bytes : bytes + 40, i == 0 ? len + 40 : len);
+		assert_int_equal(rig->profiles, before + 1);
+		seen = (seen ^ (uint64_t)rig->last.t_ns) * 0x100000001B3u;
+	}
+	return seen;
+}
+
+static void a_snapshot_anywhere_goes_on_the_same(void **state)
+{
+	struct rig *rig = *state;
+	static uint8_t bytes[1 << 14];
+	for (int indexed = 0; indexed < 2; indexed++)
+		for (int at = 1; at < 120; at += 7) {
+			restart(rig);
+			tell_mode(rig, 0x05);
+			session(rig, 0, at, indexed);
+			const size_t len = save(rig, bytes, sizeof bytes);
+			const uint64_t live = session(rig, at, at + 60, indexed);
+			restart(rig);
+			assert_true(load(rig, bytes, len));
+			assert_int_equal(session(rig, at, at + 60, indexed), live);
+		}
+}
+
+static void a_broken_snapshot_leaves_the_decoder_as_new(void **state)
+{
+	struct rig *rig = *state;
+	static uint8_t bytes[1 << 14], new[1 << 14], after[1 << 14];
+	const size_t new_len = save(rig, new, sizeof new);
+	tell_mode(rig, 0x05);
+	session(rig, 0, 100, true);
+	const size_t len = save(rig, bytes, sizeof bytes);
+	for (size_t cut = 0; cut < len; cut += 11) {
+		assert_false(load(rig, bytes, cut));
+		assert_int_equal(save(rig, after, sizeof after), new_len);
+		assert_memory_equal(after, new, new_len);
+	}
+	for (size_t at = 0; at < len; at++) {
+		bytes[at] ^= 0x80;
+		load(rig, bytes, len); /* taken or not, it bears what comes */
+		for (int i = 0; i < 3; i++) {
+			rig->t_ns += 20 * MS;
+			feed_scan(rig, (struct lms2xx_scan){.n = 361,
+			                                    .unit = LMS2XX_MM,
+			                                    .indexed = i > 0,
+			                                    .scan_index = (uint8_t)(at + (size_t)i)});
+		}
+		bytes[at] ^= 0x80;
+	}
+	assert_true(load(rig, bytes, len));
 }
 
 static void what_the_device_says_of_itself_is_counted(void **state)
@@ -481,7 +675,13 @@ int main(void)
 	    RIGGED(the_rate_is_learned_from_the_request_that_sets_it),
 	    RIGGED(partial_scans_stand_a_quarter_degree_apart),
 	    RIGGED(sub_ranges_need_the_variant_and_begin_with_the_first_turn),
-	    RIGGED(indices_tell_how_many_scans_the_line_skipped),
+	    RIGGED(indices_tell_what_was_skipped_and_what_was_lost),
+	    RIGGED(with_indices_a_lost_telegram_misplaces_nothing),
+	    RIGGED(partial_scans_are_dated_by_their_arrival_whatever_the_index),
+	    RIGGED(latency_moves_every_beam),
+	    RIGGED(the_expected_rate_is_what_the_line_lets_through),
+	    RIGGED(a_snapshot_anywhere_goes_on_the_same),
+	    RIGGED(a_broken_snapshot_leaves_the_decoder_as_new),
 	    RIGGED(what_the_device_says_of_itself_is_counted),
 	    RIGGED(error_codes_become_states_by_the_mode),
 	};

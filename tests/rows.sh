@@ -42,3 +42,16 @@ fail() {
     echo "FAILED: $*"
     exit 1
 }
+
+# status_of DEVICE KEY: of the daemon at $FACETD, e.g. `status_of laser state`; counters have the same names as in the status.
+status_of() {
+    timeout 20 "$FACET" watch --once --json 2>/dev/null |
+        sed 's/{"name":/\n&/g' | grep "^{\"name\":\"$1\"" | grep -o "\"$2\":[^,}]*" | head -n 1 | sed 's/^[^:]*://; s/"//g'
+}
+is() { # DEVICE KEY VALUE
+    [ "$(status_of "$1" "$2")" = "$3" ]
+}
+at_least() { # DEVICE KEY VALUE, whole numbers
+    now=$(status_of "$1" "$2" | cut -d. -f1)
+    [ "${now:--1}" -ge "$3" ]
+}

@@ -173,6 +173,12 @@ void control_put_device_event(struct buffer *b, const char *device, const char *
 	                 message ? message : json_string("(not UTF-8)")));
 }
 
+void control_put_clock_event(struct buffer *b, int64_t step_ns, int64_t ahead_ns)
+{
+	put(b, json_pack("{s:s, s:f, s:f}", "class", "CLOCK", "step", (double)step_ns / 1e9, "ahead",
+	                 (double)ahead_ns / 1e9));
+}
+
 static json_t *integer(uint64_t value)
 {
 	return json_integer((json_int_t)value);

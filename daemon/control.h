@@ -69,5 +69,7 @@ void control_put_version(struct buffer *);
 void control_put_answer(struct buffer *, const struct control_command *);
 void control_put_error(struct buffer *, const char *sentence);
 void control_put_device_event(struct buffer *, const char *device, const char *state, const char *text);
+/* The wall clock was set by `step_ns` and is now `ahead_ns` ahead of the times of the daemon. */
+void control_put_clock_event(struct buffer *, int64_t step_ns, int64_t ahead_ns);
 
 #endif

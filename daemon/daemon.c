@@ -50,6 +50,7 @@ struct watcher {
 
 struct daemon {
 	const struct config *config;
+	const struct driver *driver[CONFIG_DEVICES_MAX];
 	uv_loop_t loop;
 	int64_t clock_offset_ns, started_ns; /* realtime - monotonic at the start */
 	int64_t wall_offset_ns;              /* the same now */
@@ -187,10 +188,37 @@ static void watch_device(void *ctx, int device, int fd, bool readable, bool writ
 		              on_device);
 }
 
+/* A step of the wall clock changes how poses are dated, so it is an entry of the journal (law L7), and
+ * clients are told, who compare their own times with ours. */
+static void look_for_step(struct daemon *d)
+{
+	struct buffer message = {0};
+	int64_t offset_ns, step_ns;
+
+	if (!clock_offset(&offset_ns))
+		return;
+	step_ns = offset_ns - d->wall_offset_ns;
+	if (step_ns >= -STEP_NS && step_ns <= STEP_NS)
+		return;
+	log_line(LOG_NOTICE, "the wall clock was set by %+.3f s; the times of poses follow it", (double)step_ns / 1e9);
+	d->wall_offset_ns = offset_ns;
+	if (d->keep.clock)
+		d->keep.clock(d->keep.ctx, offset_ns - d->clock_offset_ns);
+	pipeline_clock(d->pipeline, offset_ns - d->clock_offset_ns);
+	if (!d->server)
+		return;
+	control_put_clock_event(&message, step_ns, offset_ns - d->clock_offset_ns);
+	server_event(d->server, (const char *)message.data, message.len);
+	buffer_finish(&message);
+}
+
 static void on_record(void *ctx, const struct record *record)
 {
 	struct daemon *d = ctx;
 
+	/* Who dates by the wall clock may be quicker than the tick. */
+	if (d->driver[record->device]->clock && record->direction == FROM_DEVICE)
+		look_for_step(d);
 	if (d->keep.record)
 		d->keep.record(d->keep.ctx, record);
 	pipeline_handle(d->pipeline, record);
@@ -276,23 +304,6 @@ static void on_reply(void *ctx, int device, const struct reply *reply)
 static void on_data(void *ctx, int device, int64_t t_ns)
 {
 	supervisor_data(((struct daemon *)ctx)->supervisor, device, t_ns);
-}
-
-/* A step of the wall clock changes how poses are dated, so it is an entry of the journal (law L7). */
-static void look_for_step(struct daemon *d)
-{
-	int64_t offset_ns, step_ns;
-
-	if (!clock_offset(&offset_ns))
-		return;
-	step_ns = offset_ns - d->wall_offset_ns;
-	if (step_ns >= -STEP_NS && step_ns <= STEP_NS)
-		return;
-	log_line(LOG_NOTICE, "the wall clock was set by %+.3f s; the times of poses follow it", (double)step_ns / 1e9);
-	d->wall_offset_ns = offset_ns;
-	if (d->keep.clock)
-		d->keep.clock(d->keep.ctx, offset_ns - d->clock_offset_ns);
-	pipeline_clock(d->pipeline, offset_ns - d->clock_offset_ns);
 }
 
 static void on_tick(uv_timer_t *timer)
@@ -600,7 +611,6 @@ static void begin_handles(struct daemon *d)
 static bool begin_parts(struct daemon *d)
 {
 	const struct config *config = d->config;
-	const struct driver *drivers[CONFIG_DEVICES_MAX];
 	struct publisher_params publisher = {.cell_m = config->map.cell_m};
 	struct worker_params worker = {.map = {.cell_m = config->map.cell_m,
 	                                       .tolerance = config->map.tolerance,
@@ -614,11 +624,11 @@ static bool begin_parts(struct daemon *d)
 
 	memcpy(publisher.map_id, d->map_id, sizeof(publisher.map_id));
 	for (int i = 0; i < config->devices; i++)
-		drivers[i] = driver_find(config->device[i].driver);
+		d->driver[i] = driver_find(config->device[i].driver);
 	d->publisher = publisher_create(&publisher);
 	d->worker = worker_create(&worker);
 	d->pipeline = pipeline_create(config, &sink);
-	d->supervisor = supervisor_create(config, drivers, &host);
+	d->supervisor = supervisor_create(config, d->driver, &host);
 	return d->publisher && d->worker && d->pipeline && d->supervisor;
 }
 

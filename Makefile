@@ -103,6 +103,11 @@ $(B)/tests/test_%: $(B)/obj/tests/test_%.o $(LIBRARIES)
 	@mkdir -p $(@D)
 	@echo '  LD   $@'
 	$(Q)$(CC) $(LDFLAGS_ALL) -o $@ $(filter %.o,$^) $(filter %.a,$^) $(LIBS) -lcmocka
+# A simulated usbfs (tests/usbfs.h) under real libusb.
+ifeq ($(call have,umockdev-1.0),yes)
+$(B)/obj/tests/test_cola_usb.o: CFLAGS_ALL += -DHAVE_UMOCKDEV $(shell pkg-config --cflags umockdev-1.0)
+$(B)/tests/test_cola_usb: LIBS += $(shell pkg-config --libs umockdev-1.0)
+endif
 $(addprefix $(B)/tests/,$(PROGRAMS)): $(B)/tests/%: $(B)/obj/tests/%.o $(LIBRARIES)
 	@mkdir -p $(@D)
 	@echo '  LD   $@'

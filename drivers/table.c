@@ -7,6 +7,9 @@ const struct driver *const driver_table[] = {
     &driver_lms2xx,
     &driver_modbus,
     &driver_pose,
+    &driver_tim,
+    &driver_lms1xx,
+    &driver_lms5xx,
     NULL,
 };
 

@@ -1,5 +1,6 @@
 /* Law L7, L2: the list of what a live daemon's loop saw, fed into the pipeline without sockets or threads, gives byte for
- * byte the map that its clients hold; as often as one likes. Simulated devices drive through the building in real time.
+ * byte the map that its clients hold; as often as one likes, and also from the list alone that begins in mid-session.
+ * Simulated devices drive through the building in real time.
  *
  *   test_replay                              the test
  *   test_replay CONFIG JOURNAL [OUT.ply]     for scripts: feeds a kept list, prints step, faces and hash of the map */
@@ -29,6 +30,7 @@ struct feed {
 	struct map *map;
 	struct pipeline *pipeline;
 	struct patch_store *patches;
+	uint64_t not_applied;
 };
 
 static struct map *new_map(const struct config *config)
@@ -53,6 +55,13 @@ static void feed_flush(void *ctx)
 	map_flush(((struct feed *)ctx)->map);
 }
 
+static void feed_not_applied(void *ctx, uint64_t number, const char *reason)
+{
+	(void)number;
+	(void)reason;
+	((struct feed *)ctx)->not_applied++;
+}
+
 /* Meshes everything at the end: what was meshed in between must not matter. */
 static void mesh_all(struct feed *feed)
 {
@@ -70,7 +79,8 @@ static struct feed *feed_journal(const char *config_path, const char *journal_pa
 {
 	static char text[1 << 20];
 	struct feed *feed = calloc(1, sizeof(*feed));
-	struct pipeline_sink sink = {.ctx = feed, .row = feed_row, .flush = feed_flush};
+	struct pipeline_sink sink = {
+	    .ctx = feed, .row = feed_row, .not_applied = feed_not_applied, .flush = feed_flush};
 	struct config_error config_error = {""};
 	FILE *file = fopen(config_path, "r");
 	size_t len = file ? fread(text, 1, sizeof(text), file) : 0;
@@ -107,17 +117,23 @@ static const char *build_directory(void)
 	return build && *build ? build : "build";
 }
 
-static pid_t start_simulation(const char *dir)
+struct live {
+	char dir[64], address[128], config[128], journal[128];
+	pid_t pid;
+	struct client *client;
+};
+
+static pid_t start_simulation(const struct live *live)
 {
-	char facet[256], facetd[256], journal[256];
+	char facet[256], facetd[256];
 	pid_t pid;
 
 	snprintf(facet, sizeof(facet), "%s/facet", build_directory());
 	snprintf(facetd, sizeof(facetd), "%s/facetd", build_directory());
-	snprintf(journal, sizeof(journal), "%s/journal", dir);
 	pid = fork();
 	if (pid == 0) {
-		execl(facet, facet, "simulate", "building", "--dir", dir, "--", facetd, "--journal", journal, NULL);
+		execl(facet, facet, "simulate", "building", "--dir", live->dir, "--", facetd, "--journal",
+		      live->journal, NULL);
 		_exit(127);
 	}
 	return pid;
@@ -140,89 +156,200 @@ static struct client *open_client(const char *address)
 	return client;
 }
 
-/* Follows the map until `rows` are in it. */
-static void follow(struct client *client, uint64_t rows)
+static void open_live(struct live *live)
+{
+	char error[CLIENT_ERROR_MAX] = "";
+
+	strcpy(live->dir, "/tmp/facet-replay-XXXXXX");
+	assert_non_null(mkdtemp(live->dir));
+	snprintf(live->address, sizeof(live->address), "unix:%s/facetd.sock", live->dir);
+	snprintf(live->config, sizeof(live->config), "%s/facetd.yaml", live->dir);
+	snprintf(live->journal, sizeof(live->journal), "%s/journal", live->dir);
+	live->pid = start_simulation(live);
+	live->client = open_client(live->address);
+	assert_int_equal(client_want(live->client, &(struct native_want){0}, error), 0);
+}
+
+/* The configuration goes with the simulation, so it is kept first. */
+static void stop_live(struct live *live)
+{
+	char command[400];
+
+	client_close(live->client);
+	snprintf(command, sizeof(command), "cp %s %s.kept", live->config, live->config);
+	assert_int_equal(system(command), 0);
+	strcat(live->config, ".kept");
+	kill(live->pid, SIGTERM);
+	waitpid(live->pid, NULL, 0);
+}
+
+static void remove_live(const struct live *live)
+{
+	char command[100];
+
+	snprintf(command, sizeof(command), "rm -rf %s", live->dir);
+	assert_int_equal(system(command), 0);
+}
+
+/* Says `command` on a connection of its own and waits for its OK. */
+static void command(const struct live *live, const char *command)
+{
+	struct client *client = open_client(live->address);
+	char error[CLIENT_ERROR_MAX] = "";
+	const char *line = NULL;
+
+	assert_int_equal(client_say(client, command, error), 0);
+	while (client_line(client, 5000, &line, error) == 1 && !strstr(line, "\"OK\""))
+		;
+	assert_non_null(line);
+	assert_non_null(strstr(line, "\"OK\""));
+	client_close(client);
+}
+
+static uint32_t generation(const struct live *live)
+{
+	const struct native_hello *hello = native_mirror_hello(client_mirror(live->client));
+
+	return hello ? hello->generation : 0;
+}
+
+/* Follows the map until `rows` are in the one of this generation. */
+static void follow(const struct live *live, uint32_t wanted, uint64_t rows)
 {
 	char error[CLIENT_ERROR_MAX] = "";
 	uint64_t step = 0;
 
 	for (int i = 0; i < 1200 && step < rows; i++) {
-		int r = client_commit(client, 100, error);
+		int r = client_commit(live->client, 100, error);
 
 		if (r < 0)
 			fail_msg("%s", error);
-		step = native_mirror_step(client_mirror(client));
+		step = generation(live) == wanted ? native_mirror_step(client_mirror(live->client)) : 0;
 	}
 	assert_true(step >= rows);
 }
 
 /* No row is taken any more; the map stands once what waited in the queue is in it. */
-static void pause_and_settle(const char *address, struct client *follower)
+static void pause_and_settle(const struct live *live)
 {
-	struct client *client = open_client(address);
 	char error[CLIENT_ERROR_MAX] = "";
-	const char *line = NULL;
 	int quiet = 0;
 
-	assert_int_equal(client_say(client, "?PAUSE", error), 0);
-	while (client_line(client, 5000, &line, error) == 1 && !strstr(line, "\"PAUSE\""))
-		;
-	assert_non_null(line);
+	command(live, "?PAUSE");
 	for (int i = 0; i < 600 && quiet < 20; i++) {
-		int r = client_commit(follower, 100, error);
+		int r = client_commit(live->client, 100, error);
 
 		assert_true(r >= 0);
 		quiet = r == 1 ? 0 : quiet + 1;
 	}
 	assert_int_equal(quiet, 20);
-	client_close(client);
 }
 
-static void a_live_map_and_its_kept_list_fed_twice_are_the_same_bytes(void **state)
-{
-	char dir[64] = "/tmp/facet-replay-XXXXXX", address[128], config[128], journal[128], command[400],
-	     error[512] = "";
-	char live[65], fed[65];
-	struct client *client;
+/* A map, as a client holds it or a fed list gives it. */
+struct state_of_map {
 	uint64_t step;
-	size_t count;
-	pid_t pid;
+	size_t patches;
+	char hash[65];
+};
+
+static struct state_of_map held_by_client(const struct live *live)
+{
+	const struct native_mirror *mirror = client_mirror(live->client);
+	struct state_of_map map = {native_mirror_step(mirror), patch_store_count(native_mirror_patches(mirror)), ""};
+
+	patch_store_hash(native_mirror_patches(mirror), map.hash);
+	assert_true(map.patches > 20);
+	return map;
+}
+
+static void expect_fed(const char *config, const char *journal, const struct state_of_map *live)
+{
+	char error[512] = "", fed[65];
+	struct feed *feed = feed_journal(config, journal, error);
+
+	if (!feed)
+		fail_msg("%s", error);
+	patch_store_hash(feed->patches, fed);
+	assert_int_equal(map_step(feed->map), live->step);
+	assert_int_equal(patch_store_count(feed->patches), live->patches);
+	assert_string_equal(live->hash, fed);
+	printf("note: %s: %llu rows, %llu not applied, %zu patches, hash %.16s\n", strrchr(journal, '/') + 1,
+	       (unsigned long long)live->step, (unsigned long long)feed->not_applied, live->patches, live->hash);
+	feed_destroy(feed);
+}
+
+/* The list `next` begins with exactly the state that feeding the one before it comes to. */
+static void expect_to_join(const char *config, const char *journal, const char *next)
+{
+	static uint8_t kept[1 << 22], fed[1 << 22];
+	const size_t head = 8 + 1 + 4; /* of the file and its first entry */
+	FILE *file = fopen(next, "r");
+	size_t len = file ? fread(kept, 1, sizeof(kept), file) : 0;
+	char error[512] = "";
+	struct feed *feed = feed_journal(config, journal, error);
+	struct state s;
+
+	assert_non_null(file);
+	fclose(file);
+	assert_non_null(feed);
+	pipeline_reset(feed->pipeline);
+	state_save(&s, fed, sizeof(fed));
+	pipeline_state(feed->pipeline, &s, error);
+	assert_true(state_done(&s) && len > head + s.at);
+	assert_memory_equal(kept + head, fed, s.at);
+	printf("note: %s begins with a snapshot of %zu bytes\n", strrchr(next, '/') + 1, s.at);
+	feed_destroy(feed);
+}
+
+/* The simulated devices are stopped for longer than a silent servo is borne: links are lost. The daemon goes on. */
+static void lose_links(const struct live *live)
+{
+	assert_int_equal(kill(live->pid, SIGSTOP), 0);
+	for (int i = 0; i < 45; i++)
+		nap();
+	assert_int_equal(kill(live->pid, SIGCONT), 0);
+}
+
+/* Three maps in one session. The first: rows refused for half a second, links lost, and the map stands at its end. The second
+ * begins while it stands. The third begins while rows are under way, in the middle of a sweep. */
+static void live_maps_and_their_kept_lists_are_the_same_bytes_also_from_mid_session_on(void **state)
+{
+	struct state_of_map first, third;
+	char second[140], last[140];
+	struct live live;
+	uint32_t born;
 
 	(void)state;
-	assert_non_null(mkdtemp(dir));
-	snprintf(address, sizeof(address), "unix:%s/facetd.sock", dir);
-	snprintf(config, sizeof(config), "%s/facetd.yaml", dir);
-	snprintf(journal, sizeof(journal), "%s/journal", dir);
-	pid = start_simulation(dir);
-	client = open_client(address);
-	assert_int_equal(client_want(client, &(struct native_want){0}, error), 0);
-	follow(client, 300);
-	pause_and_settle(address, client);
-	patch_store_hash(native_mirror_patches(client_mirror(client)), live);
-	count = patch_store_count(native_mirror_patches(client_mirror(client)));
-	step = native_mirror_step(client_mirror(client));
-	client_close(client);
-	/* The configuration goes with the simulation. */
-	snprintf(command, sizeof(command), "cp %s %s.kept", config, config);
-	assert_int_equal(system(command), 0);
-	strcat(config, ".kept");
-	kill(pid, SIGTERM);
-	waitpid(pid, NULL, 0);
-	assert_true(count > 20);
+	open_live(&live);
+	follow(&live, 1, 1);
+	born = generation(&live);
+	follow(&live, born, 100);
+	command(&live, "?PAUSE");
+	for (int i = 0; i < 5; i++)
+		nap();
+	command(&live, "?RESUME");
+	follow(&live, born, 200);
+	lose_links(&live);
+	follow(&live, born, native_mirror_step(client_mirror(live.client)) + 150);
+	pause_and_settle(&live);
+	first = held_by_client(&live);
+	command(&live, "?RESET");
+	command(&live, "?RESUME");
+	follow(&live, born + 1, 120);
+	command(&live, "?RESET");
+	follow(&live, born + 2, 200);
+	pause_and_settle(&live);
+	third = held_by_client(&live);
+	stop_live(&live);
+	snprintf(second, sizeof(second), "%s.2", live.journal);
+	snprintf(last, sizeof(last), "%s.3", live.journal);
 	for (int round = 0; round < 2; round++) {
-		struct feed *feed = feed_journal(config, journal, error);
-
-		if (!feed)
-			fail_msg("%s", error);
-		assert_int_equal(map_step(feed->map), step);
-		assert_int_equal(patch_store_count(feed->patches), count);
-		patch_store_hash(feed->patches, fed);
-		assert_string_equal(live, fed);
-		feed_destroy(feed);
+		expect_fed(live.config, live.journal, &first);
+		expect_fed(live.config, last, &third);
 	}
-	printf("note: %llu rows, %zu patches, hash %.16s\n", (unsigned long long)step, count, live);
-	snprintf(command, sizeof(command), "rm -rf %s", dir);
-	assert_int_equal(system(command), 0);
+	expect_to_join(live.config, live.journal, second);
+	expect_to_join(live.config, second, last);
+	remove_live(&live);
 }
 
 /* For scripts */
@@ -267,7 +394,7 @@ static int feed_for_script(int argc, char **argv)
 int main(int argc, char **argv)
 {
 	const struct CMUnitTest tests[] = {
-	    cmocka_unit_test(a_live_map_and_its_kept_list_fed_twice_are_the_same_bytes),
+	    cmocka_unit_test(live_maps_and_their_kept_lists_are_the_same_bytes_also_from_mid_session_on),
 	};
 
 	if (argc > 2)

@@ -42,10 +42,12 @@ struct sim_device {
 	int64_t (*deadline)(void *ctx); /* of the next advance; INT64_MAX: none */
 	/* The other end (a TCP client, a USB host, whoever opened the line) came or went. */
 	void (*connected)(void *ctx, bool yes, int64_t t_ns);
+	/* False: it has no power; nobody finds it then. NULL: it always has. */
+	bool (*alive)(const void *ctx);
 	/* Serial lines: the rate at which the host's end stands now. NULL where there is none. */
 	void (*host_baud)(void *ctx, uint32_t baud);
-	/* Does it wait to hear that all it sent was taken by its reader? Then the owner says so once (played recordings are paced
-	 * by their reader). NULL: never. */
+	/* Played recordings are paced by their reader. Does it wait to hear that all it sent was taken by its reader? Then the
+	 * owner says so once. NULL: never. */
 	bool (*awaits)(const void *ctx);
 	void (*taken)(void *ctx, int64_t t_ns);
 	/* One more reader of the same device, who has to come before it gets anything (several TCP clients). False, or NULL:
@@ -60,6 +62,8 @@ struct sim_device {
 
 /* The brains. The scene is copied, what it points to is borrowed. 0 or -ENOMEM; ret->destroy frees. */
 int sim_lms2xx_create(const struct sim_lms2xx_params *, const struct scene *, int64_t t_ns, struct sim_device *ret);
+
+int sim_cola_create(const struct sim_cola_params *, const struct scene *, int64_t t_ns, struct sim_device *ret);
 
 /* One of a brain's faults, as it stands: on until it is taken back, or owed so many times. */
 struct sim_fault_state {

@@ -56,15 +56,14 @@ bool sim_line_idle(const struct sim_line *line)
 static bool befalls(struct sim_line *line, enum sim_line_fault kind, bool profile)
 {
 	struct sim_fault_state *fault = &line->fault[kind];
+	const double share = kind == SIM_GAP ? 1.0 : sim_fault_value(fault, 1.0);
 	if (fault->on)
-		return sim_random(&line->random) < sim_fault_value(fault, 1.0);
+		return sim_random(&line->random) < share;
 	return profile && sim_fault_due(fault);
 }
 
-static bool add_piece(struct sim_line *line, const uint8_t *bytes, size_t len, int64_t from_ns)
+static void add_piece(struct sim_line *line, const uint8_t *bytes, size_t len, int64_t from_ns)
 {
-	if (line->pieces == SIM_LINE_PIECES || line->end - line->begin + len > line->cap)
-		return false;
 	if (line->end + len > line->cap) {
 		memmove(line->bytes, line->bytes + line->begin, line->end - line->begin);
 		line->end -= line->begin;
@@ -75,22 +74,33 @@ static bool add_piece(struct sim_line *line, const uint8_t *bytes, size_t len, i
 	const int64_t begin_ns = line->end_ns > from_ns ? line->end_ns : from_ns;
 	line->end_ns = begin_ns + (int64_t)((double)len * line->byte_ns);
 	*piece_at(line, line->pieces++) = (struct sim_piece){.len = len, .begin_ns = begin_ns, .end_ns = line->end_ns};
-	return true;
 }
 
-/* The telegram in its pieces. */
+/* Where a telegram is cut, 0: nowhere. Of 766 telegrams of 3,374 bytes on TCP 728 were cut after one segment (the rest came
+ * in one), 13 after two, 25 not at all. */
+static size_t cut_at(struct sim_line *line, size_t len)
+{
+	if (line->segment == 0 || len <= line->segment)
+		return 0;
+	const double drawn = sim_random(&line->random) * 766;
+	if (drawn < 25)
+		return 0;
+	return drawn < 38 && len > 2 * line->segment ? 2 * line->segment : line->segment;
+}
+
+/* The telegram in its pieces: one, or two with a pause between them. */
 static bool add(struct sim_line *line, const uint8_t *bytes, size_t len, int64_t from_ns, bool profile, bool bad)
 {
 	const bool gap = befalls(line, SIM_GAP, profile);
-	const size_t size = gap ? len / 2 + 1 : line->segment > 0 ? line->segment : len;
+	const size_t cut = gap ? len / 2 : cut_at(line, len);
 	const int64_t pause_ns = gap ? (int64_t)(sim_fault_value(&line->fault[SIM_GAP], 14.0) * MS) : SEGMENT_NS;
-	const size_t needed = (len + size - 1) / size;
-	if (line->pieces + needed > SIM_LINE_PIECES || line->end - line->begin + len > line->cap)
+	if (line->pieces + 2 > SIM_LINE_PIECES || line->end - line->begin + len > line->cap)
 		return false;
-	for (size_t at = 0; at < len; at += size) {
-		const size_t n = len - at < size ? len - at : size;
-		add_piece(line, bytes + at, n, at == 0 ? from_ns : line->end_ns + pause_ns);
+	if (cut > 0) {
+		add_piece(line, bytes, cut, from_ns);
+		from_ns = line->end_ns + pause_ns;
 	}
+	add_piece(line, bytes + cut, len - cut, from_ns);
 	struct sim_piece *last = piece_at(line, line->pieces - 1);
 	last->last = true;
 	last->profile = profile;
@@ -132,6 +142,14 @@ static int64_t delayed(struct sim_line *line, int64_t from_ns)
 	return from_ns + (int64_t)(sim_random(&line->random) * sim_fault_value(fault, 5.0) * MS);
 }
 
+static void spoil_byte(struct sim_line *line, uint8_t *byte)
+{
+	if (line->text)
+		*byte = 0x01;
+	else
+		*byte ^= (uint8_t)(1 + (int)(sim_random(&line->random) * 255));
+}
+
 bool sim_line_put(struct sim_line *line, const uint8_t *telegram, size_t len, int64_t from_ns, bool profile)
 {
 	uint8_t wrong[65536 + 16];
@@ -144,8 +162,7 @@ bool sim_line_put(struct sim_line *line, const uint8_t *telegram, size_t len, in
 	const bool corrupt = befalls(line, SIM_CORRUPT, profile), crc = befalls(line, SIM_CRC, profile);
 	if (corrupt || crc) {
 		memcpy(wrong, telegram, len);
-		const size_t at = crc ? len - 1 : (size_t)(sim_random(&line->random) * (double)len);
-		wrong[at] ^= (uint8_t)(1 + (int)(sim_random(&line->random) * 255));
+		spoil_byte(line, &wrong[crc ? len - 1 : (size_t)(sim_random(&line->random) * (double)len)]);
 		telegram = wrong;
 	}
 	from_ns = delayed(line, from_ns);
@@ -236,6 +253,8 @@ int64_t sim_line_deadline(const struct sim_line *line, int64_t t_ns)
 	if (line->pieces == 0 || line->fault[SIM_STALL].on)
 		return INT64_MAX;
 	const struct sim_piece *piece = &line->piece[line->first];
+	if (piece->end_ns == HELD)
+		return INT64_MAX;
 	if (due(piece, t_ns) > piece->sent)
 		return t_ns;
 	const int64_t from_ns = piece->begin_ns > t_ns ? piece->begin_ns : t_ns;

@@ -35,6 +35,7 @@ struct sim_piece {
 
 struct sim_line {
 	double byte_ns; /* time of a byte at the line's pace; 0: a piece leaves at once */
+	bool text;      /* telegrams are text, without a check sum: a wrong byte is one that text cannot have */
 	size_t segment; /* a longer telegram leaves in pieces of this size, 0.3 ms apart; 0: whole */
 	struct sim_fault_state fault[SIM_LINE_FAULTS];
 	struct sim_counts counts;

@@ -46,6 +46,32 @@ void sim_pty_destroy(struct sim_pty *); /* closes the pty, removes the link; the
 bool sim_pty_fault(struct sim_pty *, const struct sim_fault *, bool on);
 const char *const *sim_pty_fault_kinds(void); /* the line's own; ends with NULL */
 
+/* A scanner that speaks CoLa, by TCP or USB. Paced scenes are not for it: it measures when its mirror turns. */
+enum sim_cola_model_id { SIM_TIM561, SIM_TIM571, SIM_TIM310, SIM_TIM781S, SIM_LMS111, SIM_LMS511, SIM_COLA_MODELS };
+struct sim_cola_params {
+	enum sim_cola_model_id model;
+	enum { SIM_COLA_FACTORY, SIM_COLA_A, SIM_COLA_B } dialect; /* it speaks at first */
+	bool segments;                                             /* telegrams are cut as TCP was seen to cut them */
+	uint32_t serial;                                           /* 0: the model's */
+	uint32_t start_us;                                         /* of its clock, e.g. near the wrap */
+	double drift_ppm;                         /* of its clock (and mirror) against the host's: positive runs fast */
+	double ticks_per_rad;                     /* of the encoder; 0: no encoder is connected */
+	double (*angle)(void *ctx, int64_t t_ns); /* what the encoder counts; NULL: none */
+	void *ctx;
+};
+const char *sim_cola_model_name(enum sim_cola_model_id);   /* "TiM561" */
+const char *sim_cola_model_driver(enum sim_cola_model_id); /* "tim" */
+
+/* A device behind a TCP port on loopback; port 0: any. Takes the device over, also when it fails: NULL with one
+ * sentence. */
+struct sim_tcp;
+struct sim_tcp *sim_tcp_create(uv_loop_t *, int port, const struct sim_device *, char error[160]);
+void sim_tcp_destroy(struct sim_tcp *); /* the loop must run once more */
+int sim_tcp_port(const struct sim_tcp *);
+/* The device's faults and the connection's own: "refuse", "timeout", "reset", "half-open", "unplug". */
+bool sim_tcp_fault(struct sim_tcp *, const struct sim_fault *, bool on);
+const char *const *sim_tcp_fault_kinds(void);
+
 /* A servo behind Modbus (libmodbus server): really moves with a speed. Position in 0.001 degree, i32 in two registers. */
 enum sim_servo_register { /* holding registers, also readable as input registers; 32-bit values high word first */
 	                  SIM_SERVO_POSITION = 0, /* 0,1: actual position */

@@ -369,8 +369,9 @@ static void switch_event(struct request *q)
 	struct cola *d = q->d;
 	const uint32_t on = cola_read_u(&q->reader, 1);
 	const bool monitored = d->model->monitored || cola_fault(d, SIM_COLA_MONITORED)->on;
+	const char *stream = d->model->monitored ? "LMDscandatamon" : "LMDscandata";
 	const bool scans =
-	    d->model->ranging && (!strcmp(q->name, "LMDscandata") || (monitored && !strcmp(q->name, "LMDscandatamon")));
+	    d->model->ranging && (!strcmp(q->name, stream) || (monitored && !strcmp(q->name, "LMDscandatamon")));
 	const bool other = !strcmp(q->name, "LIDoutputstate") || !strcmp(q->name, "LIDinputstate") ||
 	                   (d->model->lms && !strcmp(q->name, "LFErec"));
 	if (!cola_reader_done(&q->reader) || on > 1) {

@@ -52,7 +52,7 @@ const struct key key_table[] = {
 	{GROUP_DEVICE, "name", KEY_TEXT, KEY_ALL, .required = true, DEVICE(name), .help = "What messages, `tilt` and `sweep.device` call it: letters, digits, - and _."},
 	{GROUP_DEVICE, "driver", KEY_TEXT, KEY_ALL, .required = true, .choices = "lms2xx|modbus|pose|tim|lms1xx|lms5xx", DEVICE(driver), .help = "What it is."},
 
-	{GROUP_DEVICE, "port", KEY_TEXT, KEY_LMS2XX, .required = true, .example = "/dev/ttyUSB0", DEVICE(port), .help = "Serial line. A name under /dev/serial/by-id/ stays the same over reboots."},
+	{GROUP_DEVICE, "port", KEY_TEXT, KEY_LMS2XX, .required = true, .example = "/dev/ttyUSB0", DEVICE(port), .help = "Serial line: a path (names under /dev/serial/by-id/ stay the same over reboots), or usb:VENDOR:PRODUCT[:SERIAL], an adapter wherever it is plugged in."},
 	{GROUP_DEVICE, "baud", KEY_INTEGER, KEY_LMS2XX, .preset = "38400", .example = "500000", .choices = "9600|19200|38400|500000", DEVICE(baud), .help = "Rate to stream at; the rate the scanner has now is found. 500000 needs RS-422."},
 	{GROUP_DEVICE, "variant", KEY_VARIANT, KEY_LMS2XX, .preset = "180/0.5", .choices = "180/1|180/0.5|180/0.25|100/1|100/0.5|100/0.25", .help = "Field of view / resolution in degrees. 180/0.25 is made of partial scans."},
 	{GROUP_DEVICE, "unit", KEY_CHOICE, KEY_LMS2XX, .preset = "keep", .choices = "keep|mm|cm", DEVICE(range_unit), .help = "Unit of its ranges; keep: as the scanner is set. Changing it writes its memory, which wears."},

@@ -51,6 +51,7 @@ struct line {
 	int flaps;        /* short streams in a row */
 	bool untold;      /* it streams, and nobody was told */
 	char logged[160]; /* the failure that was logged last; empty since it streamed */
+	char noted[328];  /* the note that was logged last */
 };
 
 struct supervisor {
@@ -105,14 +106,23 @@ static void tell_streaming(struct supervisor *s, struct line *line)
 	line->untold = false;
 	line->logged[0] = 0;
 	log_device(s, line, LOG_INFO, "streaming");
+	if (line->status.note[0] && strcmp(line->noted, line->status.note) != 0)
+		log_device(s, line, LOG_NOTICE, line->status.note);
+	snprintf(line->noted, sizeof(line->noted), "%s", line->status.note);
 }
 
-static void begin_streaming(struct supervisor *s, struct line *line, int64_t t_ns)
+/* `note`: of the dialogue, what is not as it was wanted; the link may have something to say, too. */
+static void begin_streaming(struct supervisor *s, struct line *line, const char *note, int64_t t_ns)
 {
+	char more[160] = "";
+
 	if (line->status.state == SUPERVISOR_STREAMING)
 		return;
 	set_state(line, SUPERVISOR_STREAMING, t_ns);
 	line->status.error[0] = 0;
+	if (line->link && line->driver->link_note)
+		line->driver->link_note(line->link, more);
+	snprintf(line->status.note, sizeof(line->status.note), "%s%s%s", note, note[0] && more[0] ? "; " : "", more);
 	line->untold = line->flaps >= FLAPS_TOLD;
 	if (!line->untold)
 		tell_streaming(s, line);
@@ -132,6 +142,7 @@ static void leave(struct supervisor *s, struct line *line, const char *why, cons
 	if (steady || line->backoff_ns == 0)
 		line->backoff_ns = SUPERVISOR_BACKOFF_MIN_NS;
 	line->untold = false;
+	line->status.note[0] = 0;
 	line->status.losses++;
 	snprintf(line->status.error, sizeof(line->status.error), "%s", why);
 	if (told || strcmp(line->logged, line->status.error) != 0) {
@@ -276,7 +287,7 @@ static void converse(struct supervisor *s, struct line *line, int64_t t_ns)
 			return;
 		}
 		if (step.state == DIALOGUE_STREAMING)
-			begin_streaming(s, line, t_ns);
+			begin_streaming(s, line, step.error, t_ns);
 		else if (line->status.state == SUPERVISOR_STREAMING && !line->stopping)
 			reconfigure(s, line, step.error, t_ns);
 		take_step(line, &step, t_ns);
@@ -323,7 +334,7 @@ static void open_line(struct supervisor *s, struct line *line, int64_t t_ns)
 		line->driver->dialogue_reset(line->dialogue, t_ns);
 		converse(s, line, t_ns);
 	} else {
-		begin_streaming(s, line, t_ns);
+		begin_streaming(s, line, "", t_ns);
 	}
 }
 

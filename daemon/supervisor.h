@@ -35,6 +35,7 @@ struct supervisor_device {
 	enum supervisor_state state;
 	int64_t since_ns;
 	char error[160]; /* of the last failure; empty since it streams */
+	char note[328];  /* while it streams: what is not as it was wanted; else empty */
 	uint64_t records, bytes_in, bytes_out, opens;
 	uint64_t losses;  /* tries that failed, and streams that ended */
 	uint64_t decoded; /* profiles, angles or poses */

@@ -82,7 +82,8 @@ struct dialogue_step {
 	bool flush;          /* discard what the line holds */
 	int64_t deadline_ns; /* call again at the latest then; INT64_MAX: only on a reply */
 	enum dialogue_state { DIALOGUE_CONFIGURING, DIALOGUE_STREAMING, DIALOGUE_FAILED } state;
-	/* DIALOGUE_FAILED: one sentence, what is wrong and what to do. CONFIGURING after STREAMING: why it begins anew. */
+	/* DIALOGUE_FAILED: one sentence, what is wrong and what to do. CONFIGURING after STREAMING: why it begins anew.
+	 * STREAMING: what is not as it was wanted, if anything. */
 	char error[160];
 };
 
@@ -130,6 +131,8 @@ struct driver {
 	void (*link_flush)(struct link *);                               /* may be NULL */
 	/* What -`error` of read or write means here, and what to do: one sentence. May be NULL: strerror. */
 	void (*link_error)(const struct link *, int error, char ret[160]);
+	/* What is worth knowing of the line that was opened, one sentence or empty: said once. May be NULL. */
+	void (*link_note)(const struct link *, char ret[160]);
 	void (*link_close)(struct link *);
 };
 

@@ -11,7 +11,8 @@
 
 struct link {
 	int fd;
-	char port[CONFIG_TEXT_MAX];
+	char port[CONFIG_TEXT_MAX]; /* the device file */
+	char note[160];
 };
 
 static struct link *link_open(const struct config_device *config, char error[160])
@@ -21,12 +22,14 @@ static struct link *link_open(const struct config_device *config, char error[160
 		snprintf(error, 160, "out of memory");
 		return NULL;
 	}
-	snprintf(link->port, sizeof link->port, "%s", config->port);
-	link->fd = serial_open(link->port, error);
+	link->fd = serial_find("/sys", config->port, link->port, sizeof link->port, error);
+	if (link->fd == 0)
+		link->fd = serial_open(link->port, error);
 	if (link->fd < 0) {
 		free(link);
 		return NULL;
 	}
+	serial_low_latency(link->fd, "/sys", link->port, link->note);
 	return link;
 }
 
@@ -65,6 +68,11 @@ static void link_flush(struct link *link)
 	tcflush(link->fd, TCIFLUSH);
 }
 
+static void link_note(const struct link *link, char ret[160])
+{
+	snprintf(ret, 160, "%s", link->note);
+}
+
 static void link_close(struct link *link)
 {
 	serial_close(link->fd);
@@ -93,5 +101,6 @@ const struct driver driver_lms2xx = {
     .link_write = link_write,
     .link_baud = link_baud,
     .link_flush = link_flush,
+    .link_note = link_note,
     .link_close = link_close,
 };

@@ -15,7 +15,10 @@
  * At 500 kBd the scanner wants its bytes one by one: one per step, 1 ms apart; when the host was busy for more than
  * 6 ms the scanner has given up on the telegram, and it is repeated from its first byte after a pause.
  *
- * While streaming, 2 s without a telegram, or a message of power-on, begin everything anew. */
+ * While streaming, 2 s without a telegram, or a message of power-on, begin everything anew.
+ *
+ * A rate that the line cannot do is found before the scanner is told of it, since the wanted rate is the first that is
+ * tried: the link fails and is opened again, and the next lower rate is streamed at. The like where the scanner refuses. */
 #include "drivers/lms2xx.h"
 
 #include <stdio.h>
@@ -55,7 +58,7 @@ static const struct {
     [STAGE_STATUS] = {LMS2XX_STATUS_REPLY, LMS2XX_REPLY_NS, "for its status"},
     [STAGE_CONFIG] = {LMS2XX_CONFIG_REPLY, LMS2XX_REPLY_NS, "for its configuration"},
     [STAGE_INSTALL] = {LMS2XX_MODE_REPLY, LMS2XX_REPLY_NS, "for installation mode"},
-    [STAGE_WRITE] = {LMS2XX_CONFIG_WRITTEN, LMS2XX_WRITE_NS, "to take unit and measuring mode"},
+    [STAGE_WRITE] = {LMS2XX_CONFIG_WRITTEN, LMS2XX_WRITE_NS, "to take its new settings"},
     [STAGE_LEAVE] = {LMS2XX_MODE_REPLY, LMS2XX_REPLY_NS, "to leave installation mode"},
     [STAGE_VARIANT] = {LMS2XX_VARIANT_REPLY, LMS2XX_REPLY_NS, "for the variant"},
     [STAGE_BAUD] = {LMS2XX_MODE_REPLY, LMS2XX_REPLY_NS, "for the rate"},
@@ -64,16 +67,17 @@ static const struct {
     [STAGE_STOP] = {LMS2XX_MODE_REPLY, LMS2XX_REPLY_NS, "to stop measuring"},
 };
 
-enum { RATES = 7, GAPS_MAX = 20, RESTARTS_MAX = 3 };
+enum { RATES = 7, GAPS_MAX = 20, RESTARTS_MAX = 3, WRITES_MAX = 3 };
 #define NEVER INT64_MAX
 
 struct dialogue {
 	/* what is wanted */
 	uint32_t wanted_baud;
 	int fov_deg, resolution_cdeg;
-	bool parts; /* a quarter degree over 180 degrees: by partial scans */
-	int mode;   /* measuring mode, -1: as it is */
-	int unit;   /* enum lms2xx_unit, -1: as it is */
+	bool parts;   /* a quarter degree over 180 degrees: by partial scans */
+	int mode;     /* measuring mode, -1: as it is */
+	int unit;     /* enum lms2xx_unit, -1: as it is */
+	bool indices; /* real-time indices on; else as they are */
 
 	enum stage stage;
 	enum stage after_settle;
@@ -82,8 +86,11 @@ struct dialogue {
 	/* the search */
 	uint32_t rate[RATES];
 	int rates, at;
+	uint32_t target;  /* rate to stream at: the wanted one, or the next lower that is not refused */
 	uint32_t worked;  /* rate of the last contact, 0: none yet */
-	uint32_t refused; /* rate at which the line was lost when it was set: not tried again unless wanted */
+	unsigned suspect; /* rate at which the line was lost the last time, as a bit */
+	unsigned refused; /* rates at which the line was lost when they were set, twice running: not tried again */
+	bool declined;    /* the scanner does not take the target */
 	bool setting;     /* a rate was asked for and no step came since */
 	int restarts;     /* searches since the last stream */
 
@@ -98,10 +105,23 @@ struct dialogue {
 
 	bool variant_fits;
 	struct lms2xx_config config; /* to be written */
+	int writes;                  /* of it since it was as wanted: its memory wears */
 	int64_t heard_ns;            /* last valid telegram */
 	const char *why;             /* everything begins anew, NULL: it is the first time */
 	char error[160];
+	char note[160]; /* why it does not stream at the wanted rate */
 };
+
+static const uint32_t all_rates[] = {500000, 38400, 19200, 9600};
+enum { ALL_RATES = sizeof all_rates / sizeof all_rates[0] };
+
+static unsigned rate_bit(uint32_t baud)
+{
+	for (unsigned i = 0; i < ALL_RATES; i++)
+		if (all_rates[i] == baud)
+			return 1u << i;
+	return 0;
+}
 
 static uint32_t rate_now(const struct dialogue *d)
 {
@@ -122,7 +142,7 @@ static void fail(struct dialogue *d, const char *sentence)
 
 static void add_rate(struct dialogue *d, uint32_t baud)
 {
-	if (baud == 0 || (baud == d->refused && baud != d->wanted_baud))
+	if (baud == 0 || (d->refused & rate_bit(baud)) != 0)
 		return;
 	for (int i = 0; i < d->rates; i++)
 		if (d->rate[i] == baud)
@@ -130,12 +150,30 @@ static void add_rate(struct dialogue *d, uint32_t baud)
 	d->rate[d->rates++] = baud;
 }
 
+/* The wanted rate, else the next lower one that the line does, else any. */
+static void choose_target(struct dialogue *d)
+{
+	d->declined = false;
+	d->note[0] = 0;
+	d->target = d->wanted_baud;
+	for (int i = 0; i < ALL_RATES && (d->refused & rate_bit(d->target)) != 0; i++)
+		if (all_rates[i] < d->wanted_baud)
+			d->target = all_rates[i];
+	for (int i = ALL_RATES - 1; i >= 0 && (d->refused & rate_bit(d->target)) != 0; i--)
+		d->target = all_rates[i];
+	if (d->target != d->wanted_baud)
+		snprintf(d->note, sizeof d->note,
+		         "streams at %u Bd: the line refuses %u, use an adapter that knows it or set `baud`",
+		         (unsigned)d->target, (unsigned)d->wanted_baud);
+}
+
 /* Everything anew, beginning at rate `first` (0: as usual). */
 static void search(struct dialogue *d, uint32_t first)
 {
+	choose_target(d);
 	d->rates = d->at = 0;
 	add_rate(d, first);
-	add_rate(d, d->wanted_baud);
+	add_rate(d, d->target);
 	add_rate(d, d->worked);
 	add_rate(d, 9600);
 	add_rate(d, 38400);
@@ -180,7 +218,7 @@ static size_t request(const struct dialogue *d, enum stage stage, uint8_t *ret)
 		len = 5;
 		break;
 	case STAGE_BAUD:
-		p[1] = lms2xx_baud_mode(d->wanted_baud);
+		p[1] = lms2xx_baud_mode(d->target);
 		break;
 	case STAGE_START:
 		p[1] = d->parts ? LMS2XX_MODE_PARTS : LMS2XX_MODE_STREAM;
@@ -206,7 +244,7 @@ static void enter(struct dialogue *d, enum stage stage, int64_t t_ns)
 
 static void after_baud(struct dialogue *d, int64_t t_ns)
 {
-	enter(d, rate_now(d) == d->wanted_baud ? STAGE_START : STAGE_BAUD, t_ns);
+	enter(d, rate_now(d) == d->target || d->declined ? STAGE_START : STAGE_BAUD, t_ns);
 }
 
 static void after_config(struct dialogue *d, int64_t t_ns)
@@ -227,7 +265,14 @@ static void compare_config(struct dialogue *d, const struct reply *reply)
 		d->config.bytes[LMS2XX_CONFIG_MODE] = (uint8_t)d->mode;
 	if (d->unit >= 0)
 		d->config.bytes[LMS2XX_CONFIG_UNIT] = (uint8_t)d->unit;
-	if (memcmp(was.bytes, d->config.bytes, was.len) != 0)
+	if (d->indices)
+		d->config.bytes[LMS2XX_CONFIG_AVAILABILITY] |= LMS2XX_AVAILABILITY_INDICES;
+	const bool differs = memcmp(was.bytes, d->config.bytes, was.len) != 0;
+	if (!differs)
+		d->writes = 0;
+	if (differs && d->writes++ >= WRITES_MAX)
+		fail(d, "the scanner does not keep its new settings: remove `unit`, `mode` and `indices`");
+	else if (differs)
 		enter(d, STAGE_INSTALL, reply->t_ns);
 	else
 		after_config(d, reply->t_ns);
@@ -248,8 +293,7 @@ static void written(struct dialogue *d, const struct reply *reply)
 	if (lms2xx_decode_config(reply->payload, reply->len, &taken))
 		enter(d, STAGE_LEAVE, reply->t_ns);
 	else
-		fail(d,
-		     "the scanner does not take the unit or measuring mode: remove `unit` and `mode` to keep its own");
+		fail(d, "the scanner does not take its new settings: remove `unit`, `mode` and `indices`");
 }
 
 static void switched(struct dialogue *d, const struct reply *reply)
@@ -265,7 +309,7 @@ static void switched(struct dialogue *d, const struct reply *reply)
 /* The rate is the scanner's from now on; the line follows. */
 static void follow_baud(struct dialogue *d)
 {
-	search(d, d->wanted_baud);
+	search(d, d->target);
 	d->after_settle = STAGE_VERIFY;
 }
 
@@ -273,12 +317,8 @@ static void mode_refused(struct dialogue *d, uint8_t result)
 {
 	char sentence[160];
 	if (d->stage == STAGE_INSTALL && result == 1)
-		snprintf(
-		    sentence, sizeof sentence,
-		    "the scanner refuses the password for its configuration: remove `unit` and `mode` to keep its own");
-	else if (d->stage == STAGE_BAUD)
-		snprintf(sentence, sizeof sentence, "the scanner refuses %u Bd: set `baud` to a rate that it knows",
-		         (unsigned)d->wanted_baud);
+		snprintf(sentence, sizeof sentence,
+		         "the scanner refuses the password for its settings: remove `unit`, `mode` and `indices`");
 	else
 		snprintf(sentence, sizeof sentence,
 		         "the scanner was asked %s and reports a fault (%u): look at its manual",
@@ -286,10 +326,24 @@ static void mode_refused(struct dialogue *d, uint8_t result)
 	fail(d, sentence);
 }
 
+/* It stays at the rate it has. */
+static void decline(struct dialogue *d)
+{
+	d->declined = true;
+	snprintf(d->note, sizeof d->note,
+	         "streams at %u Bd: the scanner refuses %u, set `baud` to a rate that it knows", (unsigned)rate_now(d),
+	         (unsigned)d->target);
+}
+
 /* The expected reply to the exchange of this stage came. */
 static void advance(struct dialogue *d, const struct reply *reply)
 {
 	const int64_t t_ns = reply->t_ns;
+	if (reply->kind == LMS2XX_MODE_REPLY && reply->payload[1] != 0 && d->stage == STAGE_BAUD) {
+		decline(d);
+		enter(d, STAGE_START, t_ns);
+		return;
+	}
 	if (reply->kind == LMS2XX_MODE_REPLY && reply->payload[1] != 0 && d->stage != STAGE_STOP) {
 		mode_refused(d, reply->payload[1]);
 		return;
@@ -350,7 +404,7 @@ static void nobody_there(struct dialogue *d)
 }
 
 /* All tries of an exchange are used up. */
-static void give_up(struct dialogue *d)
+static void give_up(struct dialogue *d, int64_t t_ns)
 {
 	if (d->stage == STAGE_STOP) {
 		fail(d, "");
@@ -361,6 +415,9 @@ static void give_up(struct dialogue *d)
 		}
 		d->at = d->rates - 1;
 		nobody_there(d);
+	} else if (d->stage == STAGE_BAUD && d->rejected) {
+		decline(d);
+		enter(d, STAGE_START, t_ns);
 	} else if (d->rejected || ++d->restarts >= RESTARTS_MAX) {
 		char sentence[160];
 		snprintf(sentence, sizeof sentence, "the scanner was asked %s and %s: switch it off and on",
@@ -377,7 +434,7 @@ static void again(struct dialogue *d, int64_t t_ns)
 {
 	const int tries = d->stage == STAGE_PROBE || d->stage == STAGE_STOP ? 2 : LMS2XX_TRIES;
 	if (++d->tries >= tries) {
-		give_up(d);
+		give_up(d, t_ns);
 		return;
 	}
 	d->ask = ASK_PAUSING;
@@ -500,6 +557,7 @@ void lms2xx_dialogue_step(struct dialogue *d, int64_t t_ns, struct dialogue_step
 	} else if (d->stage == STAGE_STREAMING) {
 		ret->state = DIALOGUE_STREAMING;
 		ret->deadline_ns = d->heard_ns + LMS2XX_QUIET_NS;
+		memcpy(ret->error, d->note, sizeof ret->error);
 	} else {
 		ret->deadline_ns = d->stage == STAGE_SETTLE ? d->until_ns : d->next_ns;
 		snprintf(ret->error, sizeof ret->error, "%s", d->why ? d->why : "");
@@ -518,8 +576,13 @@ void lms2xx_dialogue_stop(struct dialogue *d, int64_t t_ns)
 
 void lms2xx_dialogue_reset(struct dialogue *d, int64_t t_ns)
 {
-	if (d->setting)
-		d->refused = rate_now(d);
+	const unsigned bit = d->setting ? rate_bit(rate_now(d)) : 0;
+	d->refused |= bit & d->suspect; /* once it may have been the plug */
+	if (bit == 0 && d->stage != STAGE_FAILED)
+		d->refused = 0; /* what was unplugged comes back as it likes, with another adapter even */
+	if (d->refused == (1u << ALL_RATES) - 1)
+		d->refused = 0;
+	d->suspect = bit;
 	d->setting = false;
 	d->sent = d->len = 0;
 	d->restarts = 0;
@@ -533,7 +596,8 @@ struct dialogue *lms2xx_dialogue_create(const struct config *config, int device)
 	if (d == NULL)
 		return NULL;
 	const struct config_device *c = &config->device[device];
-	d->wanted_baud = c->baud;
+	d->wanted_baud = d->target = c->baud;
+	d->indices = c->indices == INDICES_ON;
 	d->fov_deg = c->fov_deg;
 	d->resolution_cdeg = c->resolution_cdeg;
 	d->parts = c->fov_deg == 180 && c->resolution_cdeg == 25;

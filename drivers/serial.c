@@ -7,7 +7,6 @@
 
 #include <errno.h>
 #include <fcntl.h>
-#include <stdbool.h>
 #include <stdio.h>
 #include <string.h>
 #include <sys/ioctl.h>
@@ -16,7 +15,7 @@
 #include <termios.h>
 #include <unistd.h>
 
-static bool is_pty(int fd)
+bool serial_is_pty(int fd)
 {
 	struct stat st;
 	return fstat(fd, &st) == 0 && major(st.st_rdev) >= 136 && major(st.st_rdev) <= 143;
@@ -67,7 +66,7 @@ int serial_open(const char *path, char error[160])
 	if (fd < 0)
 		return open_failed(path, -errno, error);
 	int r = make_raw(fd);
-	if (r == 0 && !is_pty(fd) && ioctl(fd, TIOCEXCL) < 0)
+	if (r == 0 && !serial_is_pty(fd) && ioctl(fd, TIOCEXCL) < 0)
 		r = -errno;
 	if (r == 0 && tcflush(fd, TCIOFLUSH) < 0)
 		r = -errno;
@@ -80,7 +79,7 @@ int serial_open(const char *path, char error[160])
 
 void serial_close(int fd)
 {
-	if (!is_pty(fd))
+	if (!serial_is_pty(fd))
 		ioctl(fd, TIOCNXCL);
 	close(fd);
 }

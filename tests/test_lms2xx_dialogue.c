@@ -26,7 +26,7 @@ struct scanner {
 	uint8_t mode;
 	int fov_deg, resolution_cdeg;
 	uint8_t config[34];
-	bool wrong_password, refuses_config, refuses_variant, refuses_baud;
+	bool wrong_password, refuses_config, refuses_variant, refuses_baud, forgets_config;
 	uint8_t in[128];
 	size_t in_len;
 	int64_t in_ns;
@@ -59,6 +59,9 @@ struct world {
 	struct dialogue *dialogue;
 	struct dialogue_step step;
 	int64_t due_ns;
+	char note[160]; /* said with the stream */
+	int losses;
+	uint32_t line_max; /* the line takes no higher rate; 0: any */
 	int profiles, bytes_written, writes;
 	int64_t write_ns[REQUESTS]; /* of the first writes */
 	uint32_t write_baud[REQUESTS];
@@ -136,7 +139,7 @@ static void take_config(struct world *w, const uint8_t *p, size_t len)
 	assert_int_equal(len, 35);
 	s->config_writes++;
 	memcpy(s->written, p + 1, 34);
-	if (!s->refuses_config)
+	if (!s->refuses_config && !s->forgets_config)
 		memcpy(s->config, p + 1, 34);
 	put_config(w, (const uint8_t[]){LMS2XX_CONFIG_WRITTEN, !s->refuses_config}, 2);
 }
@@ -273,11 +276,26 @@ static void note_write(struct world *w)
 	w->bytes_written += (int)w->step.write_len;
 }
 
+/* As the supervisor does: closed, opened again after a while. */
+static void lose_line(struct world *w, int64_t after_ns)
+{
+	w->losses++;
+	w->outs = 0;
+	w->now_ns += after_ns;
+	driver_lms2xx.dialogue_reset(w->dialogue, w->now_ns);
+	w->due_ns = w->now_ns;
+	w->step.state = DIALOGUE_CONFIGURING;
+}
+
 static void act(struct world *w)
 {
 	driver_lms2xx.dialogue_step(w->dialogue, w->now_ns, &w->step);
 	w->due_ns = w->step.deadline_ns;
 	assert_true(w->due_ns > w->now_ns || w->step.write_len > 0);
+	if (w->step.state == DIALOGUE_STREAMING && w->step.error[0] != 0)
+		strcpy(w->note, w->step.error);
+	else if (w->step.state == DIALOGUE_STREAMING)
+		w->note[0] = 0;
 	if (w->step.write_len > 0) {
 		note_write(w);
 		decode(w, TO_DEVICE, w->step.write, w->step.write_len);
@@ -287,7 +305,9 @@ static void act(struct world *w)
 			w->stall_after = 0;
 		}
 	}
-	if (w->step.baud != 0)
+	if (w->step.baud != 0 && w->line_max != 0 && w->step.baud > w->line_max)
+		lose_line(w, 250 * MS);
+	else if (w->step.baud != 0)
 		w->line_baud = w->step.baud;
 	if (w->step.flush)
 		w->outs = 0;
@@ -385,9 +405,8 @@ static int teardown(void **state)
 static void must_stream(struct world *w, int64_t within_ns)
 {
 	run(w, w->now_ns + within_ns, DIALOGUE_STREAMING);
-	assert_string_equal(w->step.error, "");
 	assert_int_equal(w->step.state, DIALOGUE_STREAMING);
-	assert_int_equal(w->line_baud, w->config->device[0].baud);
+	assert_true(w->note[0] != 0 || w->line_baud == w->config->device[0].baud);
 	const int before = w->profiles;
 	run(w, w->now_ns + SECONDS, -1);
 	assert_true(w->profiles > before);
@@ -575,16 +594,15 @@ static void nobody_there_is_said_in_a_sentence(void **state)
 static void refusals_are_said_in_a_sentence(void **state)
 {
 	struct world *w = *state;
-	static const char *const says[] = {"refuses the password", "does not take the unit",
-	                                   "does not know this variant", "refuses 500000 Bd"};
-	for (int i = 0; i < 4; i++) {
+	static const char *const says[] = {"refuses the password", "does not take its new settings",
+	                                   "does not know this variant"};
+	for (int i = 0; i < 3; i++) {
 		fresh(w);
 		w->config->device[0].mode = i < 2 ? 0x01 : -1;
 		w->config->device[0].fov_deg = i == 2 ? 100 : 180;
 		w->scanner.wrong_password = i == 0;
 		w->scanner.refuses_config = i == 1;
 		w->scanner.refuses_variant = i == 2;
-		w->scanner.refuses_baud = i == 3;
 		begin(w);
 		run(w, w->now_ns + 60 * SECONDS, DIALOGUE_FAILED);
 		assert_int_equal(w->step.state, DIALOGUE_FAILED);
@@ -677,19 +695,126 @@ static void a_stop_ends_in_any_state_whoever_is_there(void **state)
 	}
 }
 
-static void a_rate_the_line_broke_at_is_not_searched_again(void **state)
+static void a_rate_the_line_broke_at_twice_is_not_searched_again(void **state)
 {
 	struct world *w = *state;
 	w->scanner.deaf = true;
 	w->config->device[0].baud = 38400;
+	w->line_max = 115200;
 	begin(w);
-	while (w->step.baud != 500000)
-		act(w), w->now_ns = w->due_ns;
-	driver_lms2xx.dialogue_reset(w->dialogue, w->now_ns); /* the line refused the rate, and was opened anew */
-	w->due_ns = w->now_ns;
 	run(w, w->now_ns + 30 * SECONDS, DIALOGUE_FAILED);
+	assert_int_equal(w->losses, 2);
 	assert_string_equal(w->step.error,
 	                    "no scanner answers at 38400, 9600, 19200 Bd: check its power, the cable, and `port`");
+}
+
+/* A 16550 keeps its old rate: the link says so once, and what works is streamed at. */
+static void a_rate_the_line_refuses_is_replaced_by_the_next_lower(void **state)
+{
+	struct world *w = *state;
+	static const uint32_t highest[] = {9600, 19200, 38400, 115200, 9600};
+	for (int i = 0; i < 5; i++) {
+		fresh(w);
+		w->config->device[0].baud = i < 4 ? 500000 : 38400;
+		w->line_max = highest[i];
+		begin(w);
+		must_stream(w, 20 * SECONDS);
+		assert_int_equal(w->line_baud, highest[i] == 115200 ? 38400 : highest[i]);
+		assert_non_null(strstr(w->note, i < 4 ? "the line refuses 500000" : "the line refuses 38400"));
+		/* Unplugged, and plugged in again behind an adapter that knows the rate. */
+		w->line_max = 0;
+		lose_line(w, SECONDS);
+		must_stream(w, 20 * SECONDS);
+		assert_string_equal(w->note, "");
+		assert_int_equal(w->line_baud, w->config->device[0].baud);
+	}
+}
+
+static void a_plug_pulled_while_the_rate_is_set_is_no_refusal(void **state)
+{
+	struct world *w = *state;
+	begin(w);
+	act(w);
+	assert_int_equal(w->step.baud, 500000);
+	lose_line(w, SECONDS);
+	must_stream(w, 20 * SECONDS);
+	assert_int_equal(w->line_baud, 500000);
+	assert_string_equal(w->note, "");
+}
+
+static void a_rate_the_scanner_refuses_is_said_and_done_without(void **state)
+{
+	struct world *w = *state;
+	w->scanner.refuses_baud = true;
+	begin(w);
+	must_stream(w, 20 * SECONDS);
+	assert_int_equal(w->line_baud, 9600);
+	assert_string_equal(w->note,
+	                    "streams at 9600 Bd: the scanner refuses 500000, set `baud` to a rate that it knows");
+}
+
+static void indices_are_switched_on_once_and_only_if_asked_for(void **state)
+{
+	struct world *w = *state;
+	begin(w);
+	must_stream(w, 20 * SECONDS);
+	assert_int_equal(w->scanner.config_writes, 0);
+	end(w);
+	w->config->device[0].indices = INDICES_ON;
+	uint8_t was[34];
+	w->scanner.config[LMS2XX_CONFIG_AVAILABILITY] = 0x05;
+	memcpy(was, w->scanner.config, 34);
+	begin(w);
+	must_stream(w, 20 * SECONDS);
+	was[LMS2XX_CONFIG_AVAILABILITY] = 0x07; /* bit 1 */
+	assert_memory_equal(w->scanner.written, was, 34);
+	for (int i = 0; i < 3; i++) {
+		end(w);
+		begin(w);
+		must_stream(w, 20 * SECONDS);
+	}
+	assert_int_equal(w->scanner.config_writes, 1);
+}
+
+/* Its memory wears: who does not keep what it took is not asked for ever. */
+static void a_scanner_that_forgets_its_settings_is_written_three_times_at_most(void **state)
+{
+	struct world *w = *state;
+	w->config->device[0].indices = INDICES_ON;
+	w->scanner.config[LMS2XX_CONFIG_AVAILABILITY] = 0;
+	w->scanner.forgets_config = true;
+	begin(w);
+	for (int i = 0; i < 20; i++) {
+		run(w, w->now_ns + 10 * SECONDS, DIALOGUE_FAILED);
+		w->step = (struct dialogue_step){0};
+		w->scanner.requests = 0;
+		lose_line(w, SECONDS);
+	}
+	assert_int_equal(w->scanner.config_writes, 3);
+}
+
+static void a_power_cycle_while_it_is_set_up_begins_anew(void **state)
+{
+	struct world *w = *state;
+	static const uint32_t power_on_bauds[] = {9600, 500000};
+	for (int i = 0; i < 2; i++)
+		for (int at = 0; at < 60; at++) {
+			fresh(w);
+			w->scanner.power_on_baud = w->scanner.baud = power_on_bauds[i];
+			w->config->device[0].fov_deg = 100;
+			w->config->device[0].indices = INDICES_ON;
+			w->scanner.config[LMS2XX_CONFIG_AVAILABILITY] = 0;
+			begin(w);
+			run(w, w->now_ns + at * 20 * MS, DIALOGUE_STREAMING);
+			power_cycle(w, 300 * MS);
+			w->scanner.deaf = true; /* as long as it starts */
+			run(w, w->now_ns + 299 * MS, -1);
+			w->scanner.deaf = false;
+			run(w, w->now_ns + 10 * MS, -1);
+			must_stream(w, 60 * SECONDS);
+			assert_int_equal(w->scanner.fov_deg, 100);
+			assert_int_equal(w->scanner.config_writes, 1);
+		}
 }
 
 int main(void)
@@ -713,7 +838,13 @@ int main(void)
 	    RIGGED(two_seconds_of_silence_begin_anew),
 	    RIGGED(the_stop_is_sent_and_ends_it),
 	    RIGGED(a_stop_ends_in_any_state_whoever_is_there),
-	    RIGGED(a_rate_the_line_broke_at_is_not_searched_again),
+	    RIGGED(a_rate_the_line_broke_at_twice_is_not_searched_again),
+	    RIGGED(a_rate_the_line_refuses_is_replaced_by_the_next_lower),
+	    RIGGED(a_plug_pulled_while_the_rate_is_set_is_no_refusal),
+	    RIGGED(a_rate_the_scanner_refuses_is_said_and_done_without),
+	    RIGGED(indices_are_switched_on_once_and_only_if_asked_for),
+	    RIGGED(a_scanner_that_forgets_its_settings_is_written_three_times_at_most),
+	    RIGGED(a_power_cycle_while_it_is_set_up_begins_anew),
 	};
 	return cmocka_run_group_tests(tests, NULL, NULL);
 }

@@ -242,7 +242,7 @@ static inline void session_configure(struct session *s, const char *laser)
 	struct config_error error;
 	int n = snprintf(text, sizeof text,
 	                 "devices:\n"
-	                 "  - {name: laser, %s, range: [0.3, 30], tilt: servo}\n"
+	                 "  - {name: laser, %s, range: [0.3, 30]}\n"
 	                 "  - {name: servo, driver: modbus, connect: \"127.0.0.1:502\", unit: 1, period: 7ms,\n"
 	                 "     position: {function: 3, address: 0, type: i32, scale: 0.001deg}}\n"
 	                 "  - {name: pose, driver: pose, listen: \"unix:/tmp/nowhere\"}\n",

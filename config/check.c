@@ -112,22 +112,35 @@ static int check_line_shared(struct reader *r, const struct config *config, int 
 	return 0;
 }
 
-/* BUS-PORT as the kernel names it, 1-1.2, or a serial number. */
-static bool is_usb_place(const char *text)
+/* BUS-PORT as the kernel names it, 1-1.2. */
+static bool is_usb_port(const char *text)
 {
 	size_t n = strspn(text, "0123456789");
-	if (n && text[n] == '-') {
-		do {
-			const size_t digits = strspn(text + n + 1, "0123456789");
-			if (!digits)
-				return false;
-			n += 1 + digits;
-		} while (text[n] == '.');
-		return !text[n];
-	}
-	for (n = 0; isalnum((unsigned char)text[n]) && (unsigned char)text[n] < 128;)
+	if (!n || text[n] != '-')
+		return false;
+	do {
+		const size_t digits = strspn(text + n + 1, "0123456789");
+		if (!digits)
+			return false;
+		n += 1 + digits;
+	} while (text[n] == '.');
+	return !text[n];
+}
+
+/* A serial number is whatever its maker wrote, but a port that is half written is none. */
+static bool is_usb_serial(const char *text)
+{
+	size_t n = 0;
+	while (isgraph((unsigned char)text[n]) && (unsigned char)text[n] < 128)
 		n++;
-	return n && n <= 32 && !text[n];
+	return n && n <= 63 && !text[n] && (!strchr(text, '-') || text[strspn(text, "0123456789-.")]);
+}
+
+/* `connect` begins with usb. */
+static bool is_usb_connect(const char *connect)
+{
+	const char *place = connect + 4;
+	return !connect[3] || (connect[3] == ':' && (is_usb_port(place) || is_usb_serial(place)));
 }
 
 static int check_cola(struct reader *r, const struct config_device *device, int i)
@@ -139,7 +152,7 @@ static int check_cola(struct reader *r, const struct config_device *device, int 
 		if (keys_driver(device->driver) != KEY_TIM)
 			return reader_fail(r, line,
 			                   "devices[%d].connect: only a tim measures over USB; write HOST[:PORT]", i);
-		if (device->connect[3] && (device->connect[3] != ':' || !is_usb_place(device->connect + 4)))
+		if (!is_usb_connect(device->connect))
 			return reader_fail(
 			    r, line,
 			    "devices[%d].connect: '%s' is not usb, usb:SERIAL or usb:BUS-PORT (like usb:1-1.2)", i,

@@ -53,7 +53,7 @@ DRIVERS := $(wildcard drivers/*.c)
 DAEMON := $(filter-out daemon/facetd.c,$(wildcard daemon/*.c))
 TOOLS := $(filter-out tools/facet.c,$(wildcard tools/*.c))
 TESTS := $(patsubst tests/%.c,%,$(wildcard tests/test_*.c))
-PROGRAMS := clients steps
+PROGRAMS := clients steps usb_bed
 RIGGED := $(filter test_rig test_matrix_% test_chaos,$(TESTS)) # they stand on tests/rig.c
 THREADED := test_worker test_server test_replay test_modbus test_sim_servo test_client
 FUZZ := $(patsubst tests/%.c,%,$(wildcard tests/fuzz_*.c))
@@ -105,8 +105,8 @@ $(B)/tests/test_%: $(B)/obj/tests/test_%.o $(LIBRARIES)
 	$(Q)$(CC) $(LDFLAGS_ALL) -o $@ $(filter %.o,$^) $(filter %.a,$^) $(LIBS) -lcmocka
 # A simulated usbfs (tests/usbfs.h) under real libusb.
 ifeq ($(call have,umockdev-1.0),yes)
-$(B)/obj/tests/test_cola_usb.o: CFLAGS_ALL += -DHAVE_UMOCKDEV $(shell pkg-config --cflags umockdev-1.0)
-$(B)/tests/test_cola_usb: LIBS += $(shell pkg-config --libs umockdev-1.0)
+$(B)/obj/tests/test_cola_usb.o $(B)/obj/tests/usb_bed.o: CFLAGS_ALL += -DHAVE_UMOCKDEV $(shell pkg-config --cflags umockdev-1.0)
+$(B)/tests/test_cola_usb $(B)/tests/usb_bed: LIBS += $(shell pkg-config --libs umockdev-1.0)
 endif
 $(addprefix $(B)/tests/,$(PROGRAMS)): $(B)/tests/%: $(B)/obj/tests/%.o $(LIBRARIES)
 	@mkdir -p $(@D)

@@ -20,7 +20,7 @@ static const struct command commands[] = {
     {"replay", "a recording into a mesh", NULL},
     {"info", "what is in a recording, scan or mesh", NULL},
     {"repair", "what is whole of a cut recording", NULL},
-    {"devices", "what is plugged in, with the configuration for each", NULL},
+    {"devices", "what is plugged in, with the configuration for each", devices_main},
     {"calibrate", "offsets of tilt and mount from a recording", NULL},
     {"bench", "how fast and how true this machine makes maps", NULL},
     {"decimate", "fewer faces for a mesh", NULL},

@@ -1,0 +1,70 @@
+#!/bin/sh
+# Law: `facet devices` lists what is plugged in, each with a line that is a right configuration as it stands, and says why
+# one of them cannot be opened. On simulated machines (tests/usb_bed.c).
+cd "$(dirname "$0")/.." || exit 2
+build=${FACET_BUILD:-build}
+bed=$build/tests/usb_bed
+scratch=$(mktemp -d)
+trap 'rm -rf "$scratch"' EXIT
+failed=0
+
+fail() {
+    echo "FAILED: $*"
+    failed=1
+}
+has() { # FILE SENTENCE
+    grep -qF -- "$2" "$1" || { fail "not said: $2"; sed 's/^/    /' "$1"; }
+}
+
+"$bed" -- true >"$scratch/bed" 2>&1
+status=$?
+if [ $status -eq 77 ]; then
+    tail -n 1 "$scratch/bed"
+    exit 77
+fi
+
+# Nothing there: a sentence that helps, and no failure.
+"$bed" -- "$build/facet" devices >"$scratch/none" 2>&1 || fail "nothing plugged in is no failure"
+has "$scratch/none" "nothing found: no scanner on USB (19a2:5001), no serial line."
+
+# Two scanners, one without a serial number, two adapters, one of which udev gave no name.
+"$bed" --scanner 1-1=16160456 --scanner 1-2.3 --adapter ttyUSB0=A5XK3RJT --adapter ttyUSB1= -- \
+    "$build/facet" devices >"$scratch/many" 2>&1 || fail "status $? with devices"
+has "$scratch/many" 'SICK TiM561, serial number 16160456, port 1-1, /dev/bus/usb/001/010'
+has "$scratch/many" '- {name: laser, driver: tim, connect: "usb:16160456"}'
+has "$scratch/many" '- {name: laser2, driver: tim, connect: "usb:1-2.3"}'
+has "$scratch/many" "/dev/ttyUSB0, FTDI FT232R USB UART, 0403:6001, serial number A5XK3RJT, port 1-20, driver ftdi_sio"
+has "$scratch/many" "port: '/dev/serial/by-id/usb-FTDI_FT232R_USB_UART_A5XK3RJT-if00-port0', baud: 500000}"
+has "$scratch/many" "! the adapter holds bytes back for 16 ms"
+has "$scratch/many" "port: '/dev/ttyUSB1', baud: 500000}"
+has "$scratch/many" "! no name in /dev/serial/by-id"
+
+# The lines, pasted as they stand.
+{ echo "devices:"; grep '^ *- {' "$scratch/many"; } >"$scratch/pasted.yaml"
+[ "$(wc -l <"$scratch/pasted.yaml")" -eq 5 ] || fail "not four lines to paste"
+"$build/facetd" --check-config --config "$scratch/pasted.yaml" || fail "what is pasted is no right configuration"
+grep -- '- {name: laser, driver: lms1xx' "$scratch/many" | sed 's/.*looked for: /devices: [/; s/- {/{/; s/}$/}]/' >"$scratch/ethernet.yaml"
+"$build/facetd" --check-config --config "$scratch/ethernet.yaml" || fail "the line for Ethernet is no right configuration"
+
+"$bed" --scanner 1-1=16160456 --adapter ttyUSB0=A5XK3RJT -- "$build/facet" devices --json >"$scratch/json" || fail "--json"
+python3 -c '
+import json, sys
+usb, serial = json.load(open(sys.argv[1]))["devices"]
+assert usb["kind"] == "usb" and usb["serial"] == "16160456" and usb["port"] == "1-1" and usb["usable"] and not usb["notes"], usb
+assert serial["kind"] == "serial" and serial["id"] == "0403:6001" and serial["driver"] == "ftdi_sio" and serial["usable"], serial
+assert "usb:16160456" in usb["yaml"], usb' "$scratch/json" || fail "the JSON says something else"
+
+# A port that somebody has open.
+"$bed" --adapter ttyUSB0=A5XK3RJT -- sh -c 'exec 5<>/dev/ttyUSB0; exec "$0" devices' "$build/facet" >"$scratch/held" 2>&1
+has "$scratch/held" "! in use by facet (process"
+
+# As a user without the group. The copy is for a user who may not read this folder.
+if [ "$(id -u)" -eq 0 ] && command -v setpriv >/dev/null 2>&1; then
+    chmod 755 "$scratch" && cp "$build/facet" "$scratch/facet"
+    "$bed" --locked --scanner 1-1=16160456 -- setpriv --reuid 65534 --regid 65534 --clear-groups \
+        "$scratch/facet" devices >"$scratch/locked" 2>&1 || fail "a missing permission is no failure of the list"
+    has "$scratch/locked" "! /dev/bus/usb/001/010: no permission, and no group has it; install the udev rule 70-facetd.rules"
+else
+    echo "note: not root; a missing permission is not tried"
+fi
+exit $failed

@@ -11,7 +11,7 @@
  * An error answer does not say which request it is for: one request is outstanding, ever. A request whose answer is not
  * needed goes on when it is refused (most TiM know few variables); one that was asked for in the configuration fails
  * with the scanner's own reason. A failure that would only repeat itself is told at once, and when it comes again, kept
- * for HOLD_NS: a scanner that can never do what is asked is not asked twice a second.
+ * longer and longer: a scanner that can never do what is asked is not asked twice a second.
  *
  * The time of an exchange begins when its bytes are with the kernel, which is when the step after the write comes: while
  * a connection is being made nothing is outstanding.
@@ -42,9 +42,10 @@
 #define SILENT_NS  (250 * MS)   /* at least, five scans at most so long ... */
 #define SILENT_MAX (2000 * MS)  /* ... and at most, but two scans at least */
 #define GRACE_NS   (20 * MS)    /* the host itself may have slept: what waits in its buffers is read first */
-#define HOLD_NS    (30000 * MS)
-#define HASH       0xF4724744u /* of the password of level 3, authorised client */
-#define HASH_SAFE  0x6FD62C05u /* ... of the safety variants */
+#define HOLD_NS    (1000 * MS)  /* doubled with every time ... */
+#define HOLD_MAX   (30000 * MS) /* ... up to here */
+#define HASH       0xF4724744u  /* of the password of level 3, authorised client */
+#define HASH_SAFE  0x6FD62C05u  /* ... of the safety variants */
 #define LEVEL      3
 enum { PROBES = 4, SCANS_LOST = 5, PERIODS = 8 };
 
@@ -144,7 +145,8 @@ struct dialogue {
 
 	/* what is kept over openings */
 	bool stood_still; /* it acknowledged the stream and sent nothing: it is started the next time */
-	char told[160];   /* the last failure that would repeat itself, empty since it streamed */
+	char told[160];   /* the last failure that would repeat itself, empty since it streamed ... */
+	int64_t hold_ns;  /* ... and how long it is held when it comes again */
 
 	int64_t heard_ns; /* last telegram with a scan, or the link's opening; */
 	bool heard;       /* ... which of the two */
@@ -170,16 +172,18 @@ static void fail(struct dialogue *d, const char *sentence)
 	snprintf(d->error, sizeof d->error, "%s", sentence);
 }
 
-/* A failure that stays until somebody changes something. */
+/* A failure that stays until somebody changes something: told at once the first time, then after a while. */
 static void fail_for_long(struct dialogue *d, const char *sentence, int64_t t_ns)
 {
-	const bool again = strcmp(d->told, sentence) == 0;
 	fail(d, sentence);
-	memcpy(d->told, d->error, sizeof d->told);
-	if (again) {
-		d->stage = STAGE_HOLD;
-		d->until_ns = t_ns + HOLD_NS;
+	if (strcmp(d->told, d->error) != 0) {
+		memcpy(d->told, d->error, sizeof d->told);
+		d->hold_ns = HOLD_NS;
+		return;
 	}
+	d->stage = STAGE_HOLD;
+	d->until_ns = t_ns + d->hold_ns;
+	d->hold_ns = 2 * d->hold_ns < HOLD_MAX ? 2 * d->hold_ns : HOLD_MAX;
 }
 
 static const char *name_of(const struct dialogue *d, enum stage stage)
@@ -316,6 +320,7 @@ static void judge_identity(struct dialogue *d, int64_t t_ns)
 	    "this is a %.40s with firmware %.20s, which sends no ranges (a TiM3xx from 2.50 on): use another scanner",
 	    d->model, d->version);
 	fail_for_long(d, sentence, t_ns);
+	d->hold_ns = HOLD_MAX; /* what it is does not change */
 }
 
 static void take_identity(struct dialogue *d, struct cola_reader *r, int64_t t_ns)

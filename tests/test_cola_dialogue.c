@@ -1011,6 +1011,42 @@ static void a_scanner_without_ranges_is_said_so_and_left_in_peace(void **state)
 	destroy(w);
 }
 
+/* Refused for good it is asked less and less often; refused for a while it streams soon after. */
+static void a_refusal_is_not_repeated_fast_and_not_kept_for_long(void **state)
+{
+	(void)state;
+	struct world *w = create(LMS1XX ", every: 2");
+	w->scanner.kind = REFUSE;
+	w->scanner.code = 4;
+	w->scanner.trouble = "LMDscandatacfg";
+	w->scanner.trouble_times = -1;
+	const int64_t begin_ns = w->now_ns;
+	int times = 0;
+	for (; w->now_ns - begin_ns < 120 * SECONDS; times++) {
+		run(w, 100 * SECONDS);
+		assert_failed(w, "a value is out of its limits");
+		w->now_ns += SECONDS / 4;
+		reopen(w);
+	}
+	assert_true(times >= 5 && times <= 12);
+	destroy(w);
+	w = create(LMS1XX ", every: 2");
+	w->scanner.kind = REFUSE;
+	w->scanner.code = 4;
+	w->scanner.trouble = "LMDscandatacfg";
+	w->scanner.trouble_times = 6; /* three times read and written */
+	for (times = 0; times < 10; times++) {
+		run(w, 5 * SECONDS);
+		if (!w->ended)
+			break;
+		w->now_ns += SECONDS / 4;
+		reopen(w);
+	}
+	assert_int_equal(times, 3);
+	assert_streams(w);
+	destroy(w);
+}
+
 static void half_open_connections_are_found_within_five_scans(void **state)
 {
 	static const struct {
@@ -1199,6 +1235,7 @@ int main(void)
 	    cmocka_unit_test(an_lms1xx_is_waited_for_until_it_is_ready),
 	    cmocka_unit_test(a_scanner_that_is_idle_is_started),
 	    cmocka_unit_test(a_scanner_without_ranges_is_said_so_and_left_in_peace),
+	    cmocka_unit_test(a_refusal_is_not_repeated_fast_and_not_kept_for_long),
 	    cmocka_unit_test(half_open_connections_are_found_within_five_scans),
 	    cmocka_unit_test(a_slow_stream_is_no_dead_one),
 	    cmocka_unit_test(a_host_that_slept_loses_no_connection),

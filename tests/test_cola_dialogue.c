@@ -28,6 +28,7 @@ struct scanner {
 	bool few;         /* knows no variable of the settings (TiM) */
 	bool stands;      /* acknowledges streaming and sends nothing until it was started */
 	bool never_sends; /* ... at all */
+	bool stays_off;   /* answers that the stream is off, whatever was asked */
 	const char *model, *version, *serial;
 	int64_t answer_ns;
 	uint32_t frequency_chz, resolution_tdeg;
@@ -265,6 +266,7 @@ static void answer(struct world *w, enum cola_dialect dialect, const char *comma
 		}
 		s->streams = cola_read_u(r, 1);
 		s->next_scan_ns = s->streams ? w->now_ns + s->answer_ns + s->period_ns : NEVER;
+		s->streams = s->streams && !s->stays_off;
 		cola_write_u(&a, s->streams, 1);
 	}
 	put_frame(w, &a, s->kind == LATE && s->trouble && is(s->trouble, name) ? s->delay_ns : s->answer_ns);
@@ -1113,6 +1115,88 @@ static void silence_after_the_stream_was_switched_on_is_said(void **state)
 	destroy(w);
 }
 
+static void a_stream_that_is_not_switched_on_is_said(void **state)
+{
+	(void)state;
+	struct world *w = create(TIM);
+	w->scanner.safe = w->scanner.stays_off = true;
+	run(w, 10 * SECONDS);
+	assert_failed(w, "the scanner refuses LMDscandatamon: it does not switch it on");
+	destroy(w);
+	w = create(TIM);
+	w->scanner.stays_off = true;
+	run(w, 10 * SECONDS);
+	assert_failed(w, "event unknown"); /* it has no other name for it */
+	destroy(w);
+}
+
+/* Another client's stream on a line that both share: it never gets quiet. */
+static void a_stream_that_does_not_end_is_not_waited_for(void **state)
+{
+	(void)state;
+	struct world *w = create(TIM);
+	run(w, 2 * MS);
+	for (int i = 0; i < 60; i++) {
+		cola_dialogue_data(w->dialogue, w->now_ns);
+		run(w, 50 * MS);
+	}
+	assert_streams(w);
+	assert_true(w->asked_ns[1] - w->asked_ns[0] <= 1010 * MS);
+	destroy(w);
+}
+
+static void a_scanner_that_stands_and_refuses_the_login_is_asked_to_stream_all_the_same(void **state)
+{
+	(void)state;
+	struct world *w = create(LMS5XX);
+	w->scanner.no_login = w->scanner.stands = true;
+	run(w, 10 * SECONDS);
+	assert_failed(w, "sends no scan");
+	w->scanner.stands = false; /* somebody pressed its button */
+	reopen(w);
+	run(w, 2 * SECONDS);
+	assert_streams(w);
+	assert_int_equal(asked(w, "sMN SetAccessMode"), 2);
+	assert_int_equal(asked(w, "sMN LMCstartmeas"), 0);
+	destroy(w);
+}
+
+static void who_does_not_know_its_name_is_asked_otherwise(void **state)
+{
+	(void)state;
+	for (int dialect = 0; dialect < 2; dialect++) {
+		struct world *w = create(TIM);
+		w->scanner.speaks[COLA_A] = dialect == COLA_A;
+		w->scanner.speaks[COLA_B] = dialect == COLA_B;
+		w->scanner.model = "TiM310 ";
+		w->scanner.version = "V2.60";
+		w->scanner.kind = REFUSE;
+		w->scanner.code = 3;
+		w->scanner.trouble = "DeviceIdent";
+		w->scanner.trouble_times = -1;
+		if (dialect == COLA_A) { /* sRI 0 says both */
+			run(w, 5 * SECONDS);
+			assert_failed(w, "this is a TiM310 with firmware V2.60, which sends no ranges");
+		} else { /* the version alone accuses nobody */
+			run(w, 5 * SECONDS);
+			assert_streams(w);
+			assert_int_equal(asked(w, "sRN FirmwareVersion"), 1);
+		}
+		destroy(w);
+	}
+}
+
+static void without_any_echo_in_its_telegrams_one_is_asked_for(void **state)
+{
+	(void)state;
+	struct world *w = create(LMS1XX);
+	w->scanner.data[0] = 0;
+	run(w, 2 * SECONDS);
+	assert_streams(w);
+	assert_int_equal(w->scanner.data[0], 1);
+	destroy(w);
+}
+
 static void the_end_switches_the_stream_off(void **state)
 {
 	(void)state;
@@ -1124,6 +1208,7 @@ static void the_end_switches_the_stream_off(void **state)
 	assert_true(w->ended);
 	assert_string_equal(w->step.error, "");
 	assert_false(w->scanner.streams);
+	cola_dialogue_stop(w->dialogue, w->now_ns); /* and once more */
 	destroy(w);
 	w = create(LMS1XX); /* nobody there: no time is lost */
 	w->scanner.deaf = true;
@@ -1240,6 +1325,11 @@ int main(void)
 	    cmocka_unit_test(a_slow_stream_is_no_dead_one),
 	    cmocka_unit_test(a_host_that_slept_loses_no_connection),
 	    cmocka_unit_test(silence_after_the_stream_was_switched_on_is_said),
+	    cmocka_unit_test(a_stream_that_is_not_switched_on_is_said),
+	    cmocka_unit_test(a_stream_that_does_not_end_is_not_waited_for),
+	    cmocka_unit_test(a_scanner_that_stands_and_refuses_the_login_is_asked_to_stream_all_the_same),
+	    cmocka_unit_test(who_does_not_know_its_name_is_asked_otherwise),
+	    cmocka_unit_test(without_any_echo_in_its_telegrams_one_is_asked_for),
 	    cmocka_unit_test(the_end_switches_the_stream_off),
 	    cmocka_unit_test(a_stop_at_any_moment_ends_in_peace),
 	    cmocka_unit_test(a_link_that_is_lost_at_any_moment_begins_anew),

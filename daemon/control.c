@@ -203,26 +203,61 @@ static json_t *rows_json(const struct control_status *s)
 	                 (json_int_t)s->rows.sweep.sweeps, "dropped", dropped, "beams", beams);
 }
 
+static json_t *text_json(const char *text)
+{
+	json_t *json = json_string(text);
+
+	return json ? json : json_string("(not UTF-8)");
+}
+
+/* null where nothing is known. Without a clock of its own a device has no drift, and nobody can count what was lost. */
+static json_t *timing_json(const struct decoder_timing *t)
+{
+	json_t *json;
+
+	if (!t->known)
+		return json_null();
+	json = json_pack("{s:f, s:{s:f, s:f}, s:I}", "expected", t->expected_hz, "jitter_ms", "p50",
+	                 (double)t->jitter_p50_ns / 1e6, "p99", (double)t->jitter_p99_ns / 1e6, "lost",
+	                 (json_int_t)t->lost);
+	if (t->stamps) {
+		json_object_set_new(json, "offset", json_real((double)t->offset_ns / 1e9));
+		json_object_set_new(json, "drift_ppm", json_real(t->drift_ppm));
+	}
+	return json;
+}
+
+/* Seconds for which nothing came from a device that streams; null where that means nothing. */
+static json_t *silent_json(const struct supervisor_device *line, bool fixed, int64_t t_ns)
+{
+	int64_t last_ns = line->decoded_ns > line->since_ns ? line->decoded_ns : line->since_ns;
+
+	if (line->state != SUPERVISOR_STREAMING || fixed)
+		return json_null();
+	return json_real(t_ns > last_ns ? (double)(t_ns - last_ns) / 1e9 : 0);
+}
+
 static json_t *devices_json(const struct control_status *s)
 {
 	json_t *list = json_array();
 
 	for (int i = 0; i < s->devices; i++) {
 		const struct supervisor_device *line = &s->device[i].line;
-		json_t *counters = json_object(), *error = json_string(line->error);
+		json_t *counters = json_object();
 
 		for (int k = 0; k < s->device[i].counters.n; k++)
 			json_object_set_new(counters, s->device[i].counters.counter[k].name,
 			                    integer(s->device[i].counters.counter[k].count));
 		json_array_append_new(
 		    list,
-		    json_pack("{s:s, s:s, s:s, s:f, s:f, s:I, s:I, s:I, s:I, s:I, s:o, s:o}", "name", s->device[i].name,
-		              "driver", s->device[i].driver, "state", supervisor_state_name(line->state), "since",
-		              (double)(s->t_ns - line->since_ns) / 1e9, "rate", s->device[i].rate, "records",
-		              (json_int_t)line->decoded, "bytes_in", (json_int_t)line->bytes_in, "bytes_out",
-		              (json_int_t)line->bytes_out, "opens", (json_int_t)line->opens, "losses",
-		              (json_int_t)line->losses, "error", error ? error : json_string("(not UTF-8)"), "counters",
-		              counters));
+		    json_pack("{s:s, s:s, s:s, s:f, s:o, s:f, s:o, s:I, s:I, s:I, s:I, s:I, s:o, s:o, s:o}", "name",
+		              s->device[i].name, "driver", s->device[i].driver, "state",
+		              supervisor_state_name(line->state), "since", (double)(s->t_ns - line->since_ns) / 1e9,
+		              "silent", silent_json(line, s->device[i].fixed, s->t_ns), "rate", s->device[i].rate,
+		              "timing", timing_json(&s->device[i].timing), "records", (json_int_t)line->decoded,
+		              "bytes_in", (json_int_t)line->bytes_in, "bytes_out", (json_int_t)line->bytes_out, "opens",
+		              (json_int_t)line->opens, "losses", (json_int_t)line->losses, "error",
+		              text_json(line->error), "note", text_json(line->note), "counters", counters));
 	}
 	return list;
 }

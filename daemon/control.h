@@ -57,6 +57,8 @@ struct control_status {
 		const char *name, *driver;
 		struct supervisor_device line;
 		double rate; /* profiles, angles or poses a second */
+		bool fixed;  /* nothing is ever to come from it */
+		struct decoder_timing timing;
 		struct decoder_counters counters;
 	} device[CONFIG_DEVICES_MAX];
 	size_t clients;

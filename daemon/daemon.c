@@ -398,7 +398,9 @@ static void fill_devices(const struct daemon *d, struct control_status *s)
 		s->device[i].driver = d->config->device[i].driver;
 		s->device[i].line = *supervisor_device(d->supervisor, i);
 		s->device[i].rate = rate(d->decoded[last][i], d->decoded[first][i], span);
+		s->device[i].fixed = d->config->device[i].fixed;
 		pipeline_counters(d->pipeline, i, &s->device[i].counters);
+		pipeline_timing(d->pipeline, i, &s->device[i].timing);
 	}
 	s->rows.rate = rate(d->rows[last], d->rows[first], span);
 }

@@ -479,6 +479,7 @@ void supervisor_data(struct supervisor *s, int device, int64_t t_ns)
 	struct line *line = &s->line[device];
 
 	line->status.decoded++;
+	line->status.decoded_ns = t_ns;
 	line->noise_bytes = 0;
 	if (line->link && line->dialogue)
 		line->driver->dialogue_data(line->dialogue, t_ns);

@@ -37,8 +37,9 @@ struct supervisor_device {
 	char error[160]; /* of the last failure; empty since it streams */
 	char note[328];  /* while it streams: what is not as it was wanted; else empty */
 	uint64_t records, bytes_in, bytes_out, opens;
-	uint64_t losses;  /* tries that failed, and streams that ended */
-	uint64_t decoded; /* profiles, angles or poses */
+	uint64_t losses;    /* tries that failed, and streams that ended */
+	uint64_t decoded;   /* profiles, angles or poses */
+	int64_t decoded_ns; /* the newest of them; 0: none yet */
 };
 
 struct supervisor;

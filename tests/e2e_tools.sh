@@ -80,13 +80,34 @@ refused 1 "no whole map of step 99999999" "$facet" save "$address" -o "$scratch/
 for word in laser servo step triangles memory latency; do
     grep -q "$word" "$scratch/table" || fail "the table does not show $word"
 done
+grep -Eq '^laser .* [0-9.]+ of 37.5 +[0-9.]+/[0-9.]+ ' "$scratch/table" || fail "the table does not show rate and jitter: $(cat "$scratch/table")"
+[ "$(head -n 4 "$scratch/table" | wc -L)" -lt 100 ] || fail "the table is wider than a window: $(cat "$scratch/table")"
 "$facet" watch --once --json "$address" | python3 -c '
 import json, sys
 status = json.loads(sys.stdin.readline())
 assert status["class"] == "STATUS" and status["step"] > 0, status
-assert {d["name"] for d in status["devices"]} >= {"laser", "servo"}, status' || fail "facet watch --json"
+devices = {d["name"]: d for d in status["devices"]}
+assert devices.keys() >= {"laser", "servo"}, status
+timing = devices["laser"]["timing"]
+assert timing["expected"] == 37.5 and 0 <= timing["jitter_ms"]["p50"] <= timing["jitter_ms"]["p99"], timing
+assert devices["laser"]["note"] == "" and devices["laser"]["silent"] >= 0, devices["laser"]' || fail "facet watch --json"
 timeout 20 "$facet" watch "$address" | head -n 2 >"$scratch/lines"
 [ "$(grep -c '^step [0-9]' "$scratch/lines")" -eq 2 ] || fail "facet watch in a pipe: $(cat "$scratch/lines")"
+
+# A pose that nobody feeds is open, but nothing streams.
+cat >"$scratch/lone.yaml" <<YAML
+devices:
+  - {name: unfed, driver: pose, listen: "unix:$scratch/unfed.sock"}
+listen: {native: ["unix:$scratch/lone.sock"]}
+YAML
+"$build/facetd" --config "$scratch/lone.yaml" 2>/dev/null &
+lone=$!
+is_silent() {
+    "$facet" watch --once "unix:$scratch/lone.sock" | grep -q '^unfed .* silent .* 0.0 '
+}
+until_true 20 is_silent || fail "a pose that nobody feeds is shown as: $("$facet" watch --once "unix:$scratch/lone.sock")"
+kill $lone
+wait $lone
 
 # The document of the protocol is enough to write a client: this one, from its tables, holds the same map as facet save.
 cat >"$scratch/client.py" <<'EOF'

@@ -105,19 +105,74 @@ static double reduction_percent(json_t *status)
 
 /* The table ------------------------------------------------------------------------------------------------------- */
 
+#define SILENT_S 3.0 /* nothing came for so long: whatever its state, it does not stream */
+
+static bool is_silent(json_t *device)
+{
+	return number(device, "silent") >= SILENT_S;
+}
+
+static const char *state_of(json_t *device)
+{
+	const bool fixed = json_is_null(member(device, "silent")) && strcmp(string(device, "state"), "streaming") == 0;
+	return is_silent(device) ? "silent" : fixed ? "fixed" : string(device, "state");
+}
+
+/* What is not as it should be, one thing a line. */
+static void put_complaints(FILE *out, json_t *device)
+{
+	if (string(device, "error")[0])
+		fprintf(out, "  %.160s\n", string(device, "error"));
+	if (string(device, "note")[0])
+		fprintf(out, "  %.330s\n", string(device, "note"));
+	if (is_silent(device) && number(device, "records") > 0)
+		fprintf(out, "  nothing came for %.0f s\n", number(device, "silent"));
+	else if (is_silent(device))
+		fprintf(out, "  it is open, and nothing came yet: is anybody sending?\n");
+}
+
+/* Its clock against ours, and what became of its telegrams, by reason. */
+static void put_details(FILE *out, json_t *device)
+{
+	const bool stamps = member(device, "timing.drift_ppm") != NULL;
+	const char *name;
+	json_t *value;
+	bool counted = false;
+	if (stamps)
+		fprintf(out, "  clock %+.1f ppm, offset %.6f s", number(device, "timing.drift_ppm"),
+		        number(device, "timing.offset"));
+	json_object_foreach(member(device, "counters"), name, value) counted |= json_number_value(value) > 0;
+	if (counted)
+		put_counts(out, member(device, "counters"), stamps ? "; " : "  ");
+	if (stamps || counted)
+		fputc('\n', out);
+}
+
+static void put_device(FILE *out, json_t *device)
+{
+	char rate[32], jitter[32] = "-", lost[32] = "-";
+	const double expected = number(device, "timing.expected");
+	const int n = snprintf(rate, sizeof(rate), "%.1f", number(device, "rate"));
+	if (expected > 0)
+		snprintf(rate + n, sizeof(rate) - (size_t)n, " of %.1f", expected);
+	if (member(device, "timing.jitter_ms"))
+		snprintf(jitter, sizeof(jitter), "%.2f/%.2f", number(device, "timing.jitter_ms.p50"),
+		         number(device, "timing.jitter_ms.p99"));
+	if (member(device, "timing.drift_ppm"))
+		snprintf(lost, sizeof(lost), "%s", grouped(number(device, "timing.lost")));
+	fprintf(out, "%-11.31s %-7.12s %-11.16s %13s %16s %6s %9s\n", string(device, "name"), string(device, "driver"),
+	        state_of(device), rate, jitter, lost, grouped(number(device, "records")));
+	put_complaints(out, device);
+	put_details(out, device);
+}
+
 static void put_devices(FILE *out, json_t *status)
 {
 	size_t i;
 	json_t *device;
-	fprintf(out, "%-14s %-8s %-12s %9s %14s  %s\n", "DEVICE", "DRIVER", "STATE", "RATE", "RECORDS", "NOTES");
-	json_array_foreach(member(status, "devices"), i, device)
-	{
-		fprintf(out, "%-14.31s %-8.12s %-12.16s %6.1f Hz %14s  %.120s", string(device, "name"),
-		        string(device, "driver"), string(device, "state"), number(device, "rate"),
-		        grouped(number(device, "records")), string(device, "error"));
-		put_counts(out, member(device, "counters"), string(device, "error")[0] ? ", " : "");
-		fputc('\n', out);
-	}
+	fprintf(out, "%-11s %-7s %-11s %13s %16s %6s %9s\n", "DEVICE", "DRIVER", "STATE", "RATE Hz", "JITTER ms p50/99",
+	        "LOST", "RECORDS");
+	json_array_foreach(member(status, "devices"), i, device) put_device(out, device);
 }
 
 static void put_map(FILE *out, json_t *status)
@@ -182,8 +237,8 @@ static void put_line(FILE *out, json_t *status)
 	        number(status, "map_size.triangles_raw"), number(status, "memory.used") / 1048576,
 	        number(status, "latency_ms.p50"), number(status, "latency_ms.p99"),
 	        json_array_size(member(status, "clients")));
-	json_array_foreach(member(status, "devices"), i, device) fprintf(
-	    out, " %.31s:%.16s:%.1fHz", string(device, "name"), string(device, "state"), number(device, "rate"));
+	json_array_foreach(member(status, "devices"), i, device)
+	    fprintf(out, " %.31s:%.16s:%.1fHz", string(device, "name"), state_of(device), number(device, "rate"));
 	fputc('\n', out);
 }
 

@@ -6,7 +6,7 @@
 
 #include "drivers/cola_scan.h"
 
-/* `scan` without `values`; those of a channel count up from `base` in steps of `rise`, in its width. */
+/* The values of a channel are those it stands at, or count up from `base` in steps of `rise`, in its width. */
 static inline void telegram_channel(struct cola_writer *w, const struct cola_channel *c, unsigned base, unsigned rise)
 {
 	cola_write_chars(w, c->name, 5);
@@ -15,8 +15,9 @@ static inline void telegram_channel(struct cola_writer *w, const struct cola_cha
 	cola_write_i(w, c->start_tdeg, 4);
 	cola_write_u(w, (uint32_t)c->step_tdeg, 2);
 	cola_write_u(w, c->n, 2);
+	struct cola_reader values = c->values;
 	for (unsigned i = 0; i < c->n; i++)
-		cola_write_u(w, base + rise * i, c->bytes);
+		cola_write_u(w, values.at != NULL ? cola_read_u(&values, c->bytes) : base + rise * i, c->bytes);
 }
 
 static inline void telegram_channels(struct cola_writer *w, const struct cola_scan *s, int bytes, unsigned base,

@@ -98,7 +98,7 @@ $(B)/facetd: $(B)/obj/daemon/facetd.o $(filter-out $(B)/libtools.a,$(LIBRARIES))
 $(B)/facet: $(B)/obj/tools/facet.o $(LIBRARIES)
 	@echo '  LD   $@'
 	$(Q)$(CC) $(LDFLAGS_ALL) -o $@ $^ $(LIBS)
-$(addprefix $(B)/tests/,$(RIGGED)): $(B)/obj/tests/rig.o
+$(addprefix $(B)/tests/,$(RIGGED)): $(B)/obj/tests/rig.o $(B)/obj/tests/matrix.o
 $(B)/tests/test_%: $(B)/obj/tests/test_%.o $(LIBRARIES)
 	@mkdir -p $(@D)
 	@echo '  LD   $@'

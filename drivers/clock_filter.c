@@ -8,7 +8,7 @@
  *  - A steady stream (a telegram each scan): a late one waited somewhere, and others wait behind it. It gets the time that
  *    was its turn, and so do those behind it, though they arrive at one instant. Only when the next is late too, and did not
  *    come at the heels of the first, was a telegram lost; then the missing periods are conceded (after more of them where
- *    arrivals are ragged). The phase is the least
+ *    arrivals are ragged; at once where the caller saw a telegram being lost). The phase is the least
  *    delay of the last runs of telegrams, so that a device that runs slow is followed; a quicker arrival moves it at once.
  *  - A stream with gaps (a slow line skips scans; a recording is played at its reader's pace): how many periods passed is
  *    told by the arrival alone, as the last grid point before it. Delays have to be below a period then, and the phase is
@@ -127,7 +127,7 @@ static int64_t skipped_periods(struct clock_filter *f, int64_t delay_ns, bool at
 		return 0;
 	}
 	bool steady = f->steady >= STEADY && delay_ns <= WAIT_MAX_NS;
-	if (steady && (at_heels || f->late + 1 < f->patience)) {
+	if (steady && (at_heels || (!f->lost && f->late + 1 < f->patience))) {
 		f->late += !at_heels;
 		return 0;
 	}
@@ -172,7 +172,13 @@ int64_t clock_filter_stamp(struct clock_filter *f, int64_t arrival_ns, int turns
 		stamp = f->last_ns + 1;
 	f->last_ns = stamp;
 	f->last_arrival_ns = arrival_ns;
+	f->lost = false;
 	return stamp;
+}
+
+void clock_filter_lost(struct clock_filter *f)
+{
+	f->lost = true;
 }
 
 /* Snapshots */
@@ -188,6 +194,7 @@ static void fields(struct state *s, struct clock_filter *f)
 	state_int(s, &f->late, 0, PATIENCE_RAGGED);
 	state_int(s, &f->patience, 0, PATIENCE_RAGGED);
 	state_int(s, &f->calm, 0, CALM + 1);
+	state_bool(s, &f->lost);
 	for (int i = 0; i < CLOCK_FILTER_PHASES; i++)
 		state_i64(s, &f->phase_ns[i]);
 	state_int(s, &f->phases, 0, CLOCK_FILTER_PHASES);

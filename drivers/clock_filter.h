@@ -19,6 +19,7 @@ struct clock_filter {
 	int late;     /* telegrams running that came a period or more after their time */
 	int patience; /* so many of those mean that one was lost; more where arrivals are ragged */
 	int calm;     /* telegrams since arrivals were ragged */
+	bool lost;    /* the caller saw one being lost since the last */
 	/* A stream with gaps: how far the last arrivals were behind the grid, 0 .. period. */
 	int64_t phase_ns[CLOCK_FILTER_PHASES];
 	int phases, oldest;
@@ -34,6 +35,9 @@ void clock_filter_init(struct clock_filter *, int64_t period_ns);
  * yet); `turns` periods or more apart, less what a telegram that was quicker than all before it shows of their delay.
  * Starts anew after a gap of 2 s. */
 int64_t clock_filter_stamp(struct clock_filter *, int64_t arrival_ns, int turns);
+
+/* A telegram was lost since the last one, or may have been (bytes came that made none): if the next is late, that is why. */
+void clock_filter_lost(struct clock_filter *);
 
 void clock_filter_state(struct state *, struct clock_filter *); /* a load that failed changes nothing */
 

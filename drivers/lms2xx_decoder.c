@@ -21,6 +21,7 @@
 #include <string.h>
 
 #include "core/trig.h"
+#include "drivers/arrivals.h"
 #include "drivers/clock_filter.h"
 #include "drivers/device_clock.h"
 #include "drivers/jitter.h"
@@ -69,12 +70,15 @@ struct decoder {
 	uint8_t scan_index, telegram_index; /* of the last scan that had them */
 	bool counts;                        /* `mirror` dates the scans, else `filter` */
 	struct clock_filter filter;
+	uint64_t skipped; /* bytes that made no telegram, up to the last scan */
 	struct device_clock mirror;
 	double expected_hz;   /* by raster and rate; 0: nothing came yet */
 	struct jitter jitter; /* of the filter: for the status, not in the snapshot */
 	int64_t latency_ns;
 	int64_t heard_ns[2]; /* last bytes of a direction */
 	struct framer framer[2];
+	struct arrivals arrivals;  /* from the device */
+	int64_t begin_ns, last_ns; /* arrival of the first and the last byte of the telegram at hand */
 	uint8_t bytes[2][LINE_BYTES];
 	uint64_t count[COUNTERS];
 	struct profile profile;
@@ -231,6 +235,9 @@ static int64_t end_of_scan(struct decoder *d, const struct lms2xx_scan *scan, co
 	const double scan_ns = raster->interlace * TURN_NS;
 
 	d->counts = scan->indexed && !scan->partial;
+	if (d->framer[FROM_DEVICE].skipped != d->skipped)
+		clock_filter_lost(&d->filter);
+	d->skipped = d->framer[FROM_DEVICE].skipped;
 	if (!d->counts) {
 		const int64_t end_ns = clock_filter_stamp(&d->filter, sent_ns, raster->interlace);
 
@@ -242,12 +249,15 @@ static int64_t end_of_scan(struct decoder *d, const struct lms2xx_scan *scan, co
 	return device_clock_stamp(&d->mirror, scan->scan_index, sent_ns);
 }
 
-/* Time of the first beam of the profile, from the arrival of its telegram's last byte. */
+/* Time of the first beam of the profile, from the arrival of its telegram: the scan had ended when its first byte came,
+ * and a transfer's time before its last one. A gap makes the second late, a read of many bytes the first. */
 static int64_t first_beam(struct decoder *d, const struct lms2xx_scan *scan, const struct raster *raster,
-                          size_t telegram_len, int64_t arrival_ns)
+                          size_t telegram_len)
 {
 	const int64_t transfer_ns = d->baud > 0 ? (int64_t)telegram_len * 10 * 1000000000 / d->baud : 0;
-	const int64_t end_ns = end_of_scan(d, scan, raster, arrival_ns - transfer_ns);
+	const int64_t whole_ns = d->last_ns - transfer_ns;
+	const int64_t sent_ns = transfer_ns > 0 && d->begin_ns < whole_ns ? d->begin_ns : whole_ns;
+	const int64_t end_ns = end_of_scan(d, scan, raster, sent_ns);
 	const int64_t start_ns =
 	    end_ns - (raster->interlace - 1) * (int64_t)LMS2XX_TURN_NS - raster->fov_deg * LMS2XX_BEAM_NS;
 
@@ -272,8 +282,7 @@ static void follow_indices(struct decoder *d, const struct lms2xx_scan *scan)
 	d->telegram_index = scan->telegram_index;
 }
 
-static void take_scan(struct decoder *d, const uint8_t *payload, size_t len, int64_t t_ns,
-                      const struct record_sink *sink)
+static void take_scan(struct decoder *d, const uint8_t *payload, size_t len, const struct record_sink *sink)
 {
 	struct lms2xx_scan scan;
 	struct raster raster;
@@ -303,7 +312,7 @@ static void take_scan(struct decoder *d, const uint8_t *payload, size_t len, int
 		return;
 	}
 	fill_profile(d, &scan, &raster, lms2xx_unit_m(scan.unit));
-	d->profile.t_ns = first_beam(d, &scan, &raster, len + 6, t_ns);
+	d->profile.t_ns = first_beam(d, &scan, &raster, len + 6);
 	d->count[PROFILES]++;
 	sink->profile(sink->ctx, d->device, &d->profile);
 }
@@ -340,8 +349,7 @@ static void forget(struct decoder *d)
 	clocks_init(d);
 }
 
-static void take_telegram(struct decoder *d, const uint8_t *payload, size_t len, int64_t t_ns,
-                          const struct record_sink *sink)
+static void take_telegram(struct decoder *d, const uint8_t *payload, size_t len, const struct record_sink *sink)
 {
 	struct lms2xx_config config;
 	switch (payload[0]) {
@@ -351,7 +359,7 @@ static void take_telegram(struct decoder *d, const uint8_t *payload, size_t len,
 	case LMS2XX_SCAN_RANGE_MEAN:
 	case LMS2XX_SCAN_REFLECTIVITY:
 	case LMS2XX_PARTS_REFLECTIVITY:
-		take_scan(d, payload, len, t_ns, sink);
+		take_scan(d, payload, len, sink);
 		break;
 	case LMS2XX_CONFIG_REPLY:
 	case LMS2XX_CONFIG_WRITTEN:
@@ -393,7 +401,7 @@ static void from_device(struct decoder *d, const uint8_t *telegram, size_t len, 
 		reply.payload = telegram + 4;
 		reply.len = len - 6;
 		reply.kind = reply.payload[0];
-		take_telegram(d, reply.payload, reply.len, t_ns, sink);
+		take_telegram(d, reply.payload, reply.len, sink);
 	} else if (telegram[0] == LMS2XX_NAK) {
 		d->count[NOT_ACKNOWLEDGED]++;
 	}
@@ -407,11 +415,23 @@ static void to_device(struct decoder *d, const uint8_t *telegram, size_t len)
 		d->asked_mode = telegram[5];
 }
 
+/* What the framer has not judged yet stands behind the telegram. */
+static void date_telegram(struct decoder *d, size_t len)
+{
+	const struct framer *f = &d->framer[FROM_DEVICE];
+	const size_t behind = f->end - f->begin;
+
+	d->begin_ns = arrivals_at(&d->arrivals, behind + len);
+	d->last_ns = arrivals_at(&d->arrivals, behind + 1);
+}
+
 static void drain(struct decoder *d, enum direction direction, int64_t t_ns, const struct record_sink *sink)
 {
 	const uint8_t *telegram;
 	size_t len;
 	while ((len = framer_take(&d->framer[direction], &telegram)) > 0) {
+		if (direction == FROM_DEVICE)
+			date_telegram(d, len);
 		if (direction == FROM_DEVICE)
 			from_device(d, telegram, len, t_ns, sink);
 		else
@@ -433,7 +453,10 @@ void lms2xx_decode(struct decoder *d, const struct record *record, const struct 
 		framer_silence(framer);
 	d->heard_ns[direction] = record->t_ns;
 	for (size_t done = 0; done < record->len;) {
-		done += framer_push(framer, record->bytes + done, record->len - done);
+		const size_t taken = framer_push(framer, record->bytes + done, record->len - done);
+		done += taken;
+		if (direction == FROM_DEVICE)
+			arrivals_note(&d->arrivals, taken, record->t_ns);
 		drain(d, direction, record->t_ns, sink);
 	}
 }
@@ -468,11 +491,13 @@ static void fields(struct decoder *d, struct state *s)
 	state_bool(s, &d->counts);
 	state_double(s, &d->expected_hz);
 	clock_filter_state(s, &d->filter);
+	state_u64(s, &d->skipped);
 	device_clock_state(s, &d->mirror);
 	for (int i = 0; i < 2; i++) {
 		state_time(s, &d->heard_ns[i]);
 		framer_state(s, &d->framer[i]);
 	}
+	arrivals_state(s, &d->arrivals);
 	for (int i = 0; i < COUNTERS; i++)
 		state_u64(s, &d->count[i]);
 }

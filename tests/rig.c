@@ -81,6 +81,7 @@ struct link {
 	uint64_t lost_profiles;
 	int64_t first_request_ns;
 	uint64_t requests;
+	uint8_t heard[sizeof(((struct rig_view *)0)->heard)];
 };
 
 struct scanner {
@@ -247,7 +248,7 @@ static int beam_of(const struct truth *truth, const struct row *row, uint32_t i)
 
 static bool same_ranges(const struct truth *truth, const struct row *row)
 {
-	uint32_t step = row->n / 24 + 1, looked = 0, same = 0;
+	uint32_t step = (row->n / 24 + 1) | 1, looked = 0, same = 0;
 
 	for (uint32_t i = 0; i < row->n; i += step) {
 		int k;
@@ -584,6 +585,8 @@ static ssize_t link_write(struct link *l, const uint8_t *bytes, size_t len)
 		return (ssize_t)len;
 	if (l->first_request_ns < 0)
 		l->first_request_ns = r->now_ns;
+	for (size_t i = 0; i < len && l->requests + i < sizeof(l->heard); i++)
+		l->heard[l->requests + i] = bytes[i];
 	l->requests += len;
 	l->brain.receive(l->brain.ctx, bytes, len, r->now_ns);
 	stir(l);
@@ -832,20 +835,35 @@ static bool link_fault(struct link *l, enum fault kind, double value, bool on)
 	return true;
 }
 
-bool rig_fault(struct rig *r, const char *device, const char *kind, double value, bool on)
+static bool order(struct rig *r, const char *device, const struct sim_fault *what, bool on)
 {
 	struct link *l = &r->link[rig_find(r, device)];
-	struct sim_fault fault = {.value = value};
+	struct sim_fault fault = *what;
 
 	for (int i = 0; i < FAULTS; i++)
-		if (strcmp(kind, fault_names[i]) == 0)
-			return link_fault(l, (enum fault)i, value, on);
+		if (strcmp(fault.kind, fault_names[i]) == 0)
+			return link_fault(l, (enum fault)i, fault.value, on);
 	snprintf(fault.device, sizeof(fault.device), "%s", device);
-	snprintf(fault.kind, sizeof(fault.kind), "%s", kind);
 	if (!l->brain.fault(l->brain.ctx, &fault, on, r->now_ns))
 		return false;
 	stir(l);
 	return true;
+}
+
+bool rig_fault(struct rig *r, const char *device, const char *kind, double value, bool on)
+{
+	struct sim_fault fault = {.value = value, .for_ns = INT64_MAX};
+
+	snprintf(fault.kind, sizeof(fault.kind), "%s", kind);
+	return order(r, device, &fault, on);
+}
+
+bool rig_once(struct rig *r, const char *device, const char *kind, double value)
+{
+	struct sim_fault fault = {.value = value};
+
+	snprintf(fault.kind, sizeof(fault.kind), "%s", kind);
+	return order(r, device, &fault, true);
 }
 
 void rig_clock(struct rig *r, int64_t ahead_ns)
@@ -889,6 +907,8 @@ void rig_view(const struct rig *r, const char *device, struct rig_view *ret)
 		ret->longest_pause_ns = r->now_ns - s->last_data_ns;
 	ret->first_request_ns = l->first_request_ns < 0 ? -1 : l->first_request_ns - EPOCH_NS;
 	ret->requests = l->requests;
+	ret->heard_len = l->requests < sizeof(l->heard) ? (size_t)l->requests : sizeof(l->heard);
+	memcpy(ret->heard, l->heard, ret->heard_len);
 }
 
 void rig_mark(struct rig *r, const char *device)
@@ -900,11 +920,16 @@ void rig_mark(struct rig *r, const char *device)
 	r->scanner[i].longest_pause_ns = 0;
 }
 
+void rig_counters(const struct rig *r, const char *device, struct decoder_counters *ret)
+{
+	pipeline_counters(r->pipeline, rig_find(r, device), ret);
+}
+
 int64_t rig_count(const struct rig *r, const char *device, const char *counter)
 {
 	struct decoder_counters counters;
 
-	pipeline_counters(r->pipeline, rig_find(r, device), &counters);
+	rig_counters(r, device, &counters);
 	for (int i = 0; i < counters.n; i++)
 		if (strcmp(counters.counter[i].name, counter) == 0)
 			return (int64_t)counters.counter[i].count;
@@ -1023,6 +1048,7 @@ static void join_driver(struct rig *r, int device)
 	driver->link_baud = real->link_baud ? link_baud : NULL;
 	driver->link_flush = real->link_flush ? link_flush : NULL;
 	driver->link_error = NULL;
+	driver->link_note = NULL;
 	driver->link_close = link_close;
 }
 

@@ -59,8 +59,9 @@ void rig_run(struct rig *, int64_t for_ns);
 void rig_stop(struct rig *); /* the orderly end, until every device is closed */
 int64_t rig_now(const struct rig *);
 
-/* Orders a fault of the device or of its link, or takes it back. False: nobody knows this kind. */
+/* Orders a fault of the device or of its link, until it is taken back. False: nobody knows this kind. */
 bool rig_fault(struct rig *, const char *device, const char *kind, double value, bool on);
+bool rig_once(struct rig *, const char *device, const char *kind, double value); /* the next time it can befall */
 /* The wall clock is now so far ahead of log time. */
 void rig_clock(struct rig *, int64_t ahead_ns);
 /* Samples of the servo are late by so much, or (INT64_MAX) do not come. */
@@ -77,9 +78,12 @@ struct rig_view {
 	int64_t longest_pause_ns; /* between two profiles, since rig_mark; the one that runs now counts */
 	int64_t first_request_ns; /* when the device heard its first byte since rig_mark; -1: none yet */
 	uint64_t requests;        /* bytes that the device was sent since rig_mark */
+	size_t heard_len;         /* the first of them */
+	uint8_t heard[512];
 };
 void rig_view(const struct rig *, const char *device, struct rig_view *ret);
 void rig_mark(struct rig *, const char *device);
+void rig_counters(const struct rig *, const char *device, struct decoder_counters *ret);
 /* A counter of its decoder; -1: it has none of this name. */
 int64_t rig_count(const struct rig *, const char *device, const char *counter);
 /* Runs until the device streams and a profile came that is newer than now: how long that took, or -1. */

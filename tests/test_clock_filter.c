@@ -167,6 +167,26 @@ static void a_lost_telegram_costs_one_stamp(void **state)
 	}
 }
 
+/* Its bytes were refused: whoever saw that says so, and the next late telegram is not taken for one that waited. */
+static void a_telegram_that_was_seen_to_be_lost_costs_none(void **state)
+{
+	(void)state;
+	for (int turns = 1; turns <= 4; turns *= 2) {
+		struct line line = start(100);
+		for (int i = 0; i < 200; i++)
+			hear(&line, turns, turns, 0.2);
+		clear(&line);
+		clock_filter_lost(&line.filter);
+		hear(&line, turns, 2 * turns, 0.2);
+		/* It was only noise: nothing was lost. */
+		clock_filter_lost(&line.filter);
+		hear(&line, turns, turns, 0.2);
+		for (int i = 0; i < 200; i++)
+			hear(&line, turns, turns, 0.2);
+		assert_true(line.worst_ms < 1);
+	}
+}
+
 static void a_late_start_is_mended_by_the_first_quicker_telegram(void **state)
 {
 	struct line line = start(0);
@@ -221,6 +241,7 @@ int main(void)
 	    cmocka_unit_test(a_stream_with_gaps_stays_within_a_millisecond),
 	    cmocka_unit_test(a_slow_line_that_skips_scans_stays_within_a_millisecond),
 	    cmocka_unit_test(a_lost_telegram_costs_one_stamp),
+	    cmocka_unit_test(a_telegram_that_was_seen_to_be_lost_costs_none),
 	    cmocka_unit_test(a_late_start_is_mended_by_the_first_quicker_telegram),
 	    cmocka_unit_test(a_gap_of_two_seconds_begins_anew),
 	    cmocka_unit_test(a_clock_that_was_set_back_begins_anew),

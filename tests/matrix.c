@@ -1,0 +1,310 @@
+/* How a row is played: the device streams (or is about to be opened), counters and log are looked at, the faults are
+ * ordered and taken back when they are over, then five quiet seconds; the difference is the row. Whatever the fault, no
+ * row of points may come from anything but what the scanner measured, and every telegram that left whole must have
+ * become a profile or a count. */
+#include "tests/matrix.h"
+
+#include <setjmp.h>
+#include <stdarg.h>
+#include <stddef.h>
+#include <stdio.h>
+#include <string.h>
+
+#include <cmocka.h>
+
+#define AFTER_NS  (5 * RIG_SECOND)
+#define BEFORE_NS (3 * RIG_SECOND)
+#define TEXT_MAX  600
+
+static const struct matrix_bench *the_bench;
+static struct rig *the_rig; /* also of a row that failed */
+
+struct play {
+	const struct matrix_bench *bench;
+	const struct matrix_row *row;
+	struct rig *rig;
+	int64_t begin_ns, end_ns, again_ns;
+	size_t logged; /* before */
+	uint64_t losses;
+	int device;
+	struct decoder_counters before, after;
+};
+
+static void see_counters(const struct play *p, struct decoder_counters *ret)
+{
+	rig_counters(p->rig, p->bench->device, ret);
+}
+
+static bool among(const char *const *names, const char *name)
+{
+	for (; names && *names; names++)
+		if (strcmp(*names, name) == 0)
+			return true;
+	return false;
+}
+
+static void order_faults(const struct play *p)
+{
+	for (int i = 0; i < MATRIX_FAULTS && p->row->fault[i].kind; i++) {
+		const struct matrix_fault *f = &p->row->fault[i];
+		bool known = f->for_ns == 0 ? rig_once(p->rig, p->bench->device, f->kind, f->value)
+		                            : rig_fault(p->rig, p->bench->device, f->kind, f->value, true);
+
+		if (!known)
+			fail_msg("%s: nobody knows the fault \"%s\"", p->row->name, f->kind);
+	}
+}
+
+/* Runs until each is over, and takes it back; those for ever stay. */
+static void outlast_faults(struct play *p)
+{
+	for (;;) {
+		int64_t next_ns = INT64_MAX, now_ns = rig_now(p->rig) - p->begin_ns;
+
+		for (int i = 0; i < MATRIX_FAULTS && p->row->fault[i].kind; i++)
+			if (p->row->fault[i].for_ns > now_ns && p->row->fault[i].for_ns < next_ns)
+				next_ns = p->row->fault[i].for_ns;
+		if (next_ns == INT64_MAX)
+			break;
+		rig_run(p->rig, next_ns - now_ns);
+		for (int i = 0; i < MATRIX_FAULTS && p->row->fault[i].kind; i++)
+			if (p->row->fault[i].for_ns == next_ns)
+				rig_fault(p->rig, p->bench->device, p->row->fault[i].kind, p->row->fault[i].value,
+				          false);
+	}
+	p->end_ns = rig_now(p->rig);
+}
+
+static void begin(struct play *p)
+{
+	const char *device = p->bench->device;
+	struct rig_view view;
+
+	p->rig = the_rig = p->bench->make(p->row);
+	p->device = rig_find(p->rig, device);
+	if (!p->row->from_start) {
+		rig_start(p->rig);
+		if (rig_wait_data(p->rig, device, p->bench->setup_ns) < 0)
+			fail_msg("%s: it does not stream at first", p->row->name);
+		rig_run(p->rig, BEFORE_NS);
+	}
+	see_counters(p, &p->before);
+	p->logged = rig_logged(p->rig);
+	rig_view(p->rig, device, &view);
+	p->losses = view.line.losses;
+	rig_mark(p->rig, device);
+	p->begin_ns = rig_now(p->rig);
+	order_faults(p);
+	if (p->row->from_start)
+		rig_start(p->rig);
+}
+
+/* What was seen */
+
+static int64_t moved(const struct play *p, int i)
+{
+	return (int64_t)(p->after.counter[i].count - p->before.counter[i].count);
+}
+
+static void check_counters(const struct play *p)
+{
+	for (int i = 0; i < p->after.n; i++) {
+		const char *name = p->after.counter[i].name;
+		int64_t least = 0, most = 0;
+
+		if (among(p->bench->quiet, name))
+			continue;
+		for (int k = 0; k < MATRIX_COUNTERS && p->row->counted[k].name; k++)
+			if (strcmp(p->row->counted[k].name, name) == 0) {
+				least = p->row->counted[k].least;
+				most = p->row->counted[k].most;
+			}
+		if (moved(p, i) < least || moved(p, i) > most)
+			fail_msg("%s: counted %s %lld, not %lld to %lld", p->row->name, name, (long long)moved(p, i),
+			         (long long)least, (long long)most);
+	}
+	for (int k = 0; k < MATRIX_COUNTERS && p->row->counted[k].name; k++)
+		if (rig_count(p->rig, p->bench->device, p->row->counted[k].name) < 0)
+			fail_msg("%s: there is no counter %s", p->row->name, p->row->counted[k].name);
+}
+
+/* The devices' own lines since the row began, one behind the other. */
+static void print_log(const struct play *p, char text[TEXT_MAX])
+{
+	text[0] = 0;
+	for (size_t i = p->logged; i < rig_logged(p->rig); i++) {
+		const struct rig_log *line = rig_log(p->rig, i);
+		size_t len = strlen(text);
+
+		if (line && line->device == p->device)
+			snprintf(text + len, TEXT_MAX - len, "%s%s", len ? " / " : "", line->text);
+	}
+}
+
+static void check_log(const struct play *p)
+{
+	char text[TEXT_MAX];
+
+	print_log(p, text);
+	if (p->row->from_start && strcmp(text, "streaming") == 0)
+		text[0] = 0;
+	if (p->row->log ? !strstr(text, p->row->log) : text[0] != 0)
+		fail_msg("%s: the log says \"%s\"", p->row->name, text);
+}
+
+/* Whole telegrams are decoded, or left out for a reason that is counted. */
+static void check_account(const struct play *p, const struct rig_view *view)
+{
+	uint64_t accounted = view->profiles + view->lost_profiles;
+
+	for (int i = 0; i < p->after.n; i++)
+		if (among(p->bench->left_out, p->after.counter[i].name))
+			accounted += p->after.counter[i].count;
+	if (accounted != view->sent.sent)
+		fail_msg("%s: %llu telegrams were sent, %llu decoded, %llu lost on the way", p->row->name,
+		         (unsigned long long)view->sent.sent, (unsigned long long)view->profiles,
+		         (unsigned long long)view->lost_profiles);
+}
+
+static void check_points(const struct play *p)
+{
+	struct rig_points points;
+
+	rig_points(p->rig, p->bench->device, &points);
+	if (points.unknown_rows > 0 || points.near * 1000 < points.points * 999)
+		fail_msg("%s: %llu of %llu rows were never measured, %llu of %llu points lie where their beams ended",
+		         p->row->name, (unsigned long long)points.unknown_rows, (unsigned long long)points.rows,
+		         (unsigned long long)points.near, (unsigned long long)points.points);
+}
+
+/* What is ordered once has no end: the pause tells all. */
+static int64_t again_limit(const struct matrix_row *row)
+{
+	return row->again_ns ? row->again_ns : row->pause_ns ? row->pause_ns : 20 * RIG_SECOND;
+}
+
+static void check_flow(const struct play *p, const struct rig_view *view)
+{
+	if (p->row->pause_ns == 0)
+		return;
+	if (view->state != SUPERVISOR_STREAMING || rig_now(p->rig) - view->last_data_ns > RIG_SECOND)
+		fail_msg("%s: it does not stream at the end", p->row->name);
+	if (view->longest_pause_ns > p->row->pause_ns)
+		fail_msg("%s: %lld ms without a profile", p->row->name, (long long)(view->longest_pause_ns / RIG_MS));
+	if (p->again_ns < 0 || p->again_ns > again_limit(p->row))
+		fail_msg("%s: data %lld ms after its end", p->row->name, (long long)(p->again_ns / RIG_MS));
+}
+
+static void check(const struct play *p)
+{
+	struct rig_view view;
+	uint64_t losses;
+
+	rig_view(p->rig, p->bench->device, &view);
+	losses = view.line.losses - p->losses;
+	check_flow(p, &view);
+	check_counters(p);
+	check_log(p);
+	check_account(p, &view);
+	check_points(p);
+	if (p->row->losses >= 0 && losses != (uint64_t)p->row->losses)
+		fail_msg("%s: lost %llu times", p->row->name, (unsigned long long)losses);
+	if (p->row->check)
+		p->row->check(p->rig, p->row);
+}
+
+/* The line of the table */
+
+static void print_faults(const struct play *p, char text[TEXT_MAX])
+{
+	text[0] = 0;
+	for (int i = 0; i < MATRIX_FAULTS && p->row->fault[i].kind; i++) {
+		const struct matrix_fault *f = &p->row->fault[i];
+		size_t len = strlen(text);
+
+		len += (size_t)snprintf(text + len, TEXT_MAX - len, "%s`%s", len ? ", " : "", f->kind);
+		if (f->value != 0)
+			len += (size_t)snprintf(text + len, TEXT_MAX - len, " %g", f->value);
+		len += (size_t)snprintf(text + len, TEXT_MAX - len, "`");
+		if (f->for_ns > 0 && f->for_ns != INT64_MAX)
+			snprintf(text + len, TEXT_MAX - len, " for %g s", (double)f->for_ns * 1e-9);
+	}
+	if (p->row->keys && strlen(text) + strlen(p->row->keys) + 8 < TEXT_MAX)
+		sprintf(text + strlen(text), "%s`%s`", text[0] ? "; " : "", p->row->keys + 2);
+	if (p->row->from_start && strlen(text) + 20 < TEXT_MAX)
+		strcat(text, text[0] ? ", at start" : "at start");
+}
+
+static void print_counted(const struct play *p, char text[TEXT_MAX])
+{
+	text[0] = 0;
+	for (int i = 0; i < p->after.n; i++) {
+		size_t len = strlen(text);
+
+		if (moved(p, i) != 0 && !among(p->bench->quiet, p->after.counter[i].name))
+			snprintf(text + len, TEXT_MAX - len, "%s%s %lld", len ? ", " : "", p->after.counter[i].name,
+			         (long long)moved(p, i));
+	}
+}
+
+static void print_row(const struct play *p)
+{
+	char faults[TEXT_MAX], counted[TEXT_MAX], log[TEXT_MAX], again[40] = "";
+	struct rig_view view;
+	bool lasts = p->end_ns > p->begin_ns || p->row->from_start;
+
+	rig_view(p->rig, p->bench->device, &view);
+	print_faults(p, faults);
+	print_counted(p, counted);
+	print_log(p, log);
+	if (p->row->pause_ns > 0 && lasts)
+		snprintf(again, sizeof(again), "%lld", (long long)(p->again_ns / RIG_MS));
+	printf("row: %s | %s | %s | %s | %s | %s | ", p->bench->title, p->row->name, faults, p->row->does, counted,
+	       log);
+	if (p->row->from_start)
+		printf("| %s |\n", p->row->pause_ns ? again : "never");
+	else
+		printf("%lld | %s |\n", (long long)(view.longest_pause_ns / RIG_MS), again);
+}
+
+static void play(const struct matrix_bench *bench, const struct matrix_row *row)
+{
+	struct play p = {.bench = bench, .row = row};
+
+	begin(&p);
+	outlast_faults(&p);
+	p.again_ns = rig_wait_data(p.rig, bench->device, again_limit(row) + RIG_SECOND);
+	if (p.again_ns >= 0 && row->from_start)
+		p.again_ns += p.end_ns - p.begin_ns;
+	rig_run(p.rig, AFTER_NS);
+	see_counters(&p, &p.after);
+	print_row(&p);
+	check(&p);
+}
+
+static void a_row(void **state)
+{
+	play(the_bench, *state);
+}
+
+static int end_row(void **state)
+{
+	(void)state;
+	rig_destroy(the_rig);
+	the_rig = NULL;
+	return 0;
+}
+
+int matrix_run(const struct matrix_bench *bench, const struct matrix_row *rows, size_t n)
+{
+	struct CMUnitTest tests[MATRIX_ROWS_MAX];
+
+	assert_true(n <= MATRIX_ROWS_MAX);
+	the_bench = bench;
+	for (size_t i = 0; i < n; i++)
+		tests[i] = (struct CMUnitTest){.name = rows[i].name,
+		                               .test_func = a_row,
+		                               .teardown_func = end_row,
+		                               .initial_state = (void *)&rows[i]};
+	return _cmocka_run_group_tests(bench->title, tests, n, NULL, NULL);
+}

@@ -1,0 +1,50 @@
+/* A row of the matrix of faults, played in the rig: what is ordered, what it must come to, and one line of the table of
+ * docs/devices.md, made from what was seen. */
+#ifndef FACET_TESTS_MATRIX_H
+#define FACET_TESTS_MATRIX_H
+
+#include "tests/rig.h"
+
+#define MATRIX_FAULTS   5
+#define MATRIX_COUNTERS 6
+
+struct matrix_fault {
+	const char *kind;
+	double value;
+	int64_t for_ns; /* 0: once; INT64_MAX: for ever */
+};
+
+struct matrix_row {
+	const char *name;
+	const char *does; /* what the driver does, in words */
+	struct matrix_fault fault[MATRIX_FAULTS];
+	bool from_start;  /* it is so when the device is opened; else it befalls a stream */
+	const char *keys; /* further keys of the device, ", baud: 38400" */
+	int variant;      /* of the bench: its own meaning */
+	/* Counters that move, beside telegrams and profiles; all others must not. */
+	struct {
+		const char *name;
+		int64_t least, most;
+	} counted[MATRIX_COUNTERS];
+	const char *log;  /* stands in a line of the log since; NULL: there is no line at all */
+	int losses;       /* exactly; -1: any number */
+	int64_t pause_ns; /* without a profile at most, while it lasts included; 0: it never streams */
+	int64_t again_ns; /* a profile at most so long after its end; from_start: after the start */
+	void (*check)(struct rig *, const struct matrix_row *); /* more, may be NULL */
+};
+
+struct matrix_bench {
+	const char *title, *device;
+	struct rig *(*make)(const struct matrix_row *); /* with devices attached, not started */
+	/* Counters of whole telegrams with a profile that were left out on purpose; NULL ends. */
+	const char *const *left_out;
+	const char *const *quiet; /* counters that move without a fault; NULL ends */
+	int64_t setup_ns;         /* patience with a start without faults */
+};
+
+#define MATRIX_ROWS_MAX 100
+
+/* Plays the rows, a test each: what main returns. */
+int matrix_run(const struct matrix_bench *, const struct matrix_row *, size_t n);
+
+#endif

@@ -1,18 +1,26 @@
-/* Opening where clients connect: unix sockets for a group, TCP on loopback only. */
+/* Opening where clients connect: unix sockets for a group, TCP on loopback only.
+ *
+ * Socket activation: systemd may have opened some of them already (sd_listen_fds(3)) and keeps them open while the daemon
+ * is restarted, so no client is refused. One that stands where the configuration says is taken as it is, with the rights
+ * that its unit gave it, and its file is left alone. One that the configuration does not name is not served: what the daemon
+ * listens to is said in one place. */
 #include "daemon/listener.h"
 
 #include <errno.h>
+#include <fcntl.h>
 #include <grp.h>
 #include <netinet/in.h>
 #include <stdio.h>
 #include <string.h>
 #include <sys/socket.h>
 #include <sys/un.h>
+#include <systemd/sd-daemon.h>
 #include <unistd.h>
 
 #include "drivers/unix_socket.h"
 
-#define BACKLOG 64
+#define BACKLOG      64
+#define NOT_LOOPBACK "is not on loopback; use 127.0.0.1 here, and ssh -L to reach it from elsewhere"
 
 static int refuse(const struct listener *l, int r, const char *why, char error[320])
 {
@@ -50,6 +58,38 @@ static void give_to_group(const char *path, const char *name)
 		return; /* not a member of it: the daemon's own stays, as documented */
 }
 
+int listener_passed(void)
+{
+	int n = sd_listen_fds(0);
+
+	return n > 0 ? n : 0;
+}
+
+static bool stands_there(int fd, const struct address *address)
+{
+	struct sockaddr_storage where = {0};
+	socklen_t len = 0;
+
+	if (address->kind == ADDRESS_UNIX)
+		return sd_is_socket_unix(fd, SOCK_STREAM, 1, address->path, 0) > 0;
+	return address_sockaddr(address, &where, &len) == 0 && address->port != 0 &&
+	       sd_is_socket_sockaddr(fd, SOCK_STREAM, (struct sockaddr *)&where, len, 1) > 0;
+}
+
+/* A copy of the descriptor: the one that was passed stays, so that asking again gives the same answer. */
+static bool take_passed(struct listener *l)
+{
+	int n = listener_passed();
+
+	for (int fd = SD_LISTEN_FDS_START; fd < SD_LISTEN_FDS_START + n && !l->passed; fd++) {
+		if (!stands_there(fd, &l->address))
+			continue;
+		l->fd = fcntl(fd, F_DUPFD_CLOEXEC, 0);
+		l->passed = l->fd >= 0 && fcntl(l->fd, F_SETFL, fcntl(l->fd, F_GETFL) | O_NONBLOCK) == 0;
+	}
+	return l->passed;
+}
+
 static int open_unix(struct listener *l, const char *group, char error[320])
 {
 	struct sockaddr_un address = {.sun_family = AF_UNIX};
@@ -58,7 +98,6 @@ static int open_unix(struct listener *l, const char *group, char error[320])
 
 	_Static_assert(sizeof(l->address.path) <= sizeof(address.sun_path), "address_parse refuses what would be cut");
 	snprintf(address.sun_path, sizeof(address.sun_path), "%s", l->address.path);
-	l->local = true;
 	l->fd = socket(AF_UNIX, SOCK_STREAM | SOCK_NONBLOCK | SOCK_CLOEXEC, 0);
 	if (l->fd < 0)
 		return refuse(l, -errno, strerror(errno), error);
@@ -91,13 +130,11 @@ static void name_port(struct listener *l)
 static int open_tcp(struct listener *l, char error[320])
 {
 	struct sockaddr_storage address = {0};
-	char sentence[ADDRESS_ERROR_MAX];
 	socklen_t len = 0;
 	int on = 1;
 
-	if (address_check_loopback(&l->address, sentence) < 0 || address_sockaddr(&l->address, &address, &len) < 0)
-		return refuse(l, -EINVAL,
-		              "is not on loopback; use 127.0.0.1 here, and ssh -L to reach it from elsewhere", error);
+	if (address_sockaddr(&l->address, &address, &len) < 0)
+		return refuse(l, -EINVAL, NOT_LOOPBACK, error);
 	l->fd = socket(address.ss_family, SOCK_STREAM | SOCK_NONBLOCK | SOCK_CLOEXEC, 0);
 	if (l->fd < 0)
 		return refuse(l, -errno, strerror(errno), error);
@@ -120,7 +157,12 @@ int listener_open(struct listener *l, const char *text, const char *group, char 
 		snprintf(error, 320, "listen.native: %s", sentence);
 		return -EINVAL;
 	}
-	r = l->address.kind == ADDRESS_UNIX ? open_unix(l, group, error) : open_tcp(l, error);
+	l->local = l->address.kind == ADDRESS_UNIX;
+	if (address_check_loopback(&l->address, sentence) < 0)
+		return refuse(l, -EINVAL, NOT_LOOPBACK, error);
+	if (take_passed(l))
+		return 0;
+	r = l->local ? open_unix(l, group, error) : open_tcp(l, error);
 	if (r == 0 && listen(l->fd, BACKLOG) < 0)
 		r = refuse(l, -errno, explain_bind(-errno), error);
 	if (r < 0)

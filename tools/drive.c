@@ -6,6 +6,7 @@
 #include "tools/scenario.h"
 
 #include <errno.h>
+#include <math.h>
 #include <stdio.h>
 #include <stdlib.h>
 
@@ -21,7 +22,7 @@ struct drive {
 	struct world *world;
 	struct sim_servo *servo;
 	uint64_t seed, beams;
-	bool started;
+	bool started, endless;
 	int64_t start_ns;
 };
 
@@ -44,8 +45,13 @@ static double noise(struct drive *d)
 static struct pose pose_at(void *ctx, int64_t t_ns)
 {
 	struct drive *d = ctx;
+	double t_s = d->started ? (double)(t_ns - d->start_ns) * 1e-9 : 0.0, whole_s = world_drive_seconds(d->world);
 
-	return world_drive(d->world, d->started ? (double)(t_ns - d->start_ns) * 1e-9 : 0.0);
+	if (d->endless && t_s > 0.0) { /* there and, backwards, back */
+		t_s -= 2.0 * whole_s * floor(t_s / (2.0 * whole_s));
+		t_s = t_s < whole_s ? t_s : 2.0 * whole_s - t_s;
+	}
+	return world_drive(d->world, t_s);
 }
 
 static struct transform laser_at(struct drive *d, int64_t t_ns)
@@ -87,7 +93,7 @@ static bool ended(void *ctx, int64_t t_ns, char said[80])
 	struct drive *d = ctx;
 	double seconds = world_drive_seconds(d->world);
 
-	if (!d->started || (double)(t_ns - d->start_ns) * 1e-9 < seconds)
+	if (!d->started || d->endless || (double)(t_ns - d->start_ns) * 1e-9 < seconds)
 		return false;
 	snprintf(said, 80, "drove %.0f s", seconds);
 	return true;
@@ -128,4 +134,9 @@ int drive_stage(const char *world, uint64_t seed, struct stage *ret, char error[
 	                      .ended = ended,
 	                      .destroy = destroy};
 	return 0;
+}
+
+void drive_endless(struct stage *stage)
+{
+	((struct drive *)stage->ctx)->endless = true;
 }

@@ -1,5 +1,6 @@
-/* Joins simulated devices and a stage: the scanner on DIR/laser, the servo on DIR/servo (or on TCP), poses at 100 Hz to
- * DIR/pose.sock, and DIR/facetd.yaml, which reaches them all and lets the daemon listen on DIR/facetd.sock.
+/* Joins simulated devices and a stage: the scanner on DIR/laser (or on TCP), the servo on DIR/servo (or on TCP), poses at
+ * 100 Hz to DIR/pose.sock, and DIR/facetd.yaml, which reaches them all and lets the daemon listen on DIR/facetd.sock.
+ * Faults are ordered at DIR/simulator.sock.
  *
  * A pose goes out with the time it is true for, in CLOCK_REALTIME, as any localisation would stamp it. The offset
  * between the two clocks is taken once, as the daemon does: a step of the wall clock moves neither. A datagram that
@@ -16,21 +17,38 @@
 #include <unistd.h>
 
 #include "config/address.h"
+#include "core/trig.h"
 #include "drivers/pose_line.h"
 #include "tools/output.h"
-#include "tools/sim_device.h"
+#include "tools/sim_control.h"
 
 #define POSE_MS  10
 #define UNIT     1    /* of the servo */
 #define LASER_BD 9600 /* as from the factory */
 #define MODE_15  0x05
 #define YAML_MAX 4096
+#define TICK_DEG 0.01 /* of the encoder in a scanner's telegrams */
+
+static const struct {
+	const char *driver;
+	enum sim_cola_model_id model; /* not of the LMS2xx */
+	int range_m;
+	bool encoder;
+} lasers[SCENARIO_LASERS] = {[SCENARIO_LMS2XX] = {"lms2xx", SIM_COLA_MODELS, 30, false},
+                             [SCENARIO_TIM] = {"tim", SIM_TIM571, 25, false},
+                             [SCENARIO_LMS1XX] = {"lms1xx", SIM_LMS111, 20, true},
+                             [SCENARIO_LMS5XX] = {"lms5xx", SIM_LMS511, 30, true}};
 
 struct scenario {
 	struct scenario_params params;
 	struct stage stage;
 	struct sim_servo *servo;
-	struct sim_pty *laser;
+	struct sim_device laser; /* the shell's; to be asked what it did */
+	struct sim_pty *laser_pty;
+	struct sim_tcp *laser_tcp;
+	struct sim_control *control;
+	struct fault_target target[2];
+	bool mute; /* a fault: poses are not sent */
 	uv_timer_t *timer;
 	int pose_fd;
 	struct sockaddr_un pose_address;
@@ -70,11 +88,39 @@ static int print_servo(const struct scenario_params *params, bool sweeps, int po
 	                connect, UNIT, sweeps ? "5ms" : "2ms", SIM_SERVO_POSITION, SIM_SERVO_TARGET, SIM_SERVO_SPEED);
 }
 
-int scenario_yaml(const struct scenario_params *params, bool sweeps, int servo_port, char *ret, size_t cap)
+enum scenario_laser scenario_laser(const char *driver)
+{
+	int i = 0;
+
+	while (i < SCENARIO_LASERS && strcmp(lasers[i].driver, driver) != 0)
+		i++;
+	return (enum scenario_laser)i;
+}
+
+static int print_laser(const struct scenario_params *params, int port, char *ret, size_t cap)
+{
+	const char *driver = lasers[params->laser].driver;
+	char encoder[80] = "";
+
+	if (params->encoder) /* the servo's sense: up is positive */
+		snprintf(encoder, sizeof encoder, " encoder: {scale: %gdeg, sign: -1},", TICK_DEG);
+	if (params->laser == SCENARIO_LMS2XX)
+		return snprintf(ret, cap,
+		                "  - {name: laser, driver: %s, port: \"%s/laser\", baud: 500000, variant: 180/0.5,\n"
+		                "     range: [0.3, %d], tilt: servo}\n",
+		                driver, params->dir, lasers[params->laser].range_m);
+	return snprintf(ret, cap,
+	                "  - {name: laser, driver: %s, connect: \"127.0.0.1:%d\",%s range: [0.3, %d], tilt: %s}\n",
+	                driver, port, encoder, lasers[params->laser].range_m, params->encoder ? "laser" : "servo");
+}
+
+int scenario_yaml(const struct scenario_params *params, bool sweeps, int servo_port, int laser_port, char *ret,
+                  size_t cap)
 {
 	const char *dir = params->dir;
-	char servo[1024];
+	char laser[512], servo[1024];
 
+	print_laser(params, laser_port, laser, sizeof laser);
 	print_servo(params, sweeps, servo_port, servo, sizeof servo);
 	/* A recording has every ray through one point; a played line waits for its reader, so its reader may wait too. */
 	int n =
@@ -82,8 +128,7 @@ int scenario_yaml(const struct scenario_params *params, bool sweeps, int servo_p
 	             "# Written by `facet simulate %s`: reaches its simulated devices.\n"
 	             "%s"
 	             "devices:\n"
-	             "  - {name: laser, driver: lms2xx, port: \"%s/laser\", baud: 500000, variant: 180/0.5,\n"
-	             "     range: [0.3, 30], tilt: servo}\n"
+	             "%s"
 	             "%s"
 	             "  - {name: pose, driver: pose, listen: \"unix:%s/pose.sock\"}\n"
 	             "%s"
@@ -91,7 +136,7 @@ int scenario_yaml(const struct scenario_params *params, bool sweeps, int servo_p
 	             scenario_is_world(params->name) ? params->name : "...",
 	             sweeps ? "mount: {base_tilt: {xyz: [0.2, 0, 0.4]}, tilt_laser: {xyz: [0, 0, 0.05]}}\n"
 	                    : "map: {hold: 1s}\n",
-	             dir, servo, dir,
+	             laser, servo, dir,
 	             sweeps ? "sweep: {device: servo, from: -65deg, to: 45deg, speed: 30deg, profile: triangle}\n" : "",
 	             dir, params->tcp ? ", \"tcp:" : "", params->tcp ? params->tcp : "", params->tcp ? "\"" : "");
 
@@ -102,7 +147,8 @@ static int write_yaml(const struct scenario *s, char error[SCENARIO_ERROR_MAX])
 {
 	char yaml[YAML_MAX], path[128];
 	struct output_error why;
-	int n = scenario_yaml(&s->params, s->stage.sweeps, sim_servo_port(s->servo), yaml, sizeof yaml);
+	int n = scenario_yaml(&s->params, s->stage.sweeps, sim_servo_port(s->servo),
+	                      s->laser_tcp ? sim_tcp_port(s->laser_tcp) : 0, yaml, sizeof yaml);
 
 	if (n < 0) {
 		snprintf(error, SCENARIO_ERROR_MAX, "the configuration has no room for these names");
@@ -138,36 +184,117 @@ static void on_timer(uv_timer_t *timer)
 	int64_t now_ns = clock_ns(CLOCK_MONOTONIC);
 	char said[80];
 
-	send_pose(s, now_ns);
+	if (!s->mute)
+		send_pose(s, now_ns);
 	if (s->ended || !s->stage.ended(s->stage.ctx, now_ns, said))
 		return;
 	s->ended = true;
 	s->params.ended(s->params.ctx, said);
 }
 
+static double servo_angle(void *ctx, int64_t t_ns)
+{
+	struct scenario *s = ctx;
+
+	return sim_servo_angle(s->servo, t_ns);
+}
+
+static int create_brain(struct scenario *s)
+{
+	const struct sim_lms2xx_params lms = {
+	    .fast = s->params.fast, .baud = LASER_BD, .mode = MODE_15, .millimetres = true};
+	const struct sim_cola_params cola = {.model = lasers[s->params.laser].model,
+	                                     .segments = true,
+	                                     .ticks_per_rad = 1.0 / (TICK_DEG * TRIG_DEG),
+	                                     .angle = s->params.encoder ? servo_angle : NULL,
+	                                     .ctx = s};
+	int64_t now_ns = clock_ns(CLOCK_MONOTONIC);
+
+	return s->params.laser == SCENARIO_LMS2XX ? sim_lms2xx_create(&lms, &s->stage.scene, now_ns, &s->laser)
+	                                          : sim_cola_create(&cola, &s->stage.scene, now_ns, &s->laser);
+}
+
+static int start_laser(struct scenario *s, uv_loop_t *loop, char error[SCENARIO_ERROR_MAX])
+{
+	char link[128];
+
+	if (create_brain(s) < 0) {
+		snprintf(error, SCENARIO_ERROR_MAX, "out of memory");
+		return -ENOMEM;
+	}
+	snprintf(link, sizeof link, "%.110s/laser", s->params.dir);
+	if (s->params.laser == SCENARIO_LMS2XX)
+		s->laser_pty = sim_pty_create(loop, link, &s->laser, error);
+	else
+		s->laser_tcp = sim_tcp_create(loop, 0, &s->laser, error);
+	return s->laser_pty || s->laser_tcp ? 0 : -EIO;
+}
+
 static int start_devices(struct scenario *s, uv_loop_t *loop, char error[SCENARIO_ERROR_MAX])
 {
-	char laser[128], servo[128];
+	char servo[128];
 	struct sim_servo_params servo_params = {.rtu = s->params.tcp_servo ? NULL : servo,
 	                                        .tcp = "127.0.0.1:0",
 	                                        .slave = UNIT,
 	                                        .angle_rad = s->stage.angle_rad};
-	struct sim_lms2xx_params laser_params = {
-	    .fast = s->params.fast, .baud = LASER_BD, .mode = MODE_15, .millimetres = true};
-	struct sim_device device;
 
-	snprintf(laser, sizeof laser, "%.110s/laser", s->params.dir);
 	snprintf(servo, sizeof servo, "%.110s/servo", s->params.dir);
 	s->servo = sim_servo_create(&servo_params, error);
 	if (!s->servo)
 		return -EIO;
 	s->stage.join(s->stage.ctx, s->servo);
-	if (sim_lms2xx_create(&laser_params, &s->stage.scene, clock_ns(CLOCK_MONOTONIC), &device) < 0) {
-		snprintf(error, SCENARIO_ERROR_MAX, "out of memory");
-		return -ENOMEM;
-	}
-	s->laser = sim_pty_create(loop, laser, &device, error);
-	return s->laser ? 0 : -EIO;
+	return start_laser(s, loop, error);
+}
+
+/* ---- faults ---- */
+
+static const char *const pose_kinds[] = {"silence", NULL};
+
+static bool order(void *ctx, const struct sim_fault *fault, bool on)
+{
+	struct scenario *s = ctx;
+
+	if (!strcmp(fault->device, "pose"))
+		s->mute = on;
+	else if (s->laser_pty)
+		return sim_pty_fault(s->laser_pty, fault, on);
+	else
+		return sim_tcp_fault(s->laser_tcp, fault, on);
+	return true;
+}
+
+void scenario_status(const struct scenario *s, char *ret, size_t cap)
+{
+	struct sim_counts counts;
+	int n = snprintf(ret, cap, "laser: ");
+
+	s->laser.counts(s->laser.ctx, &counts);
+	fault_print_counts(&counts, ret + n, cap - (size_t)n);
+}
+
+static void print_status(void *ctx, char ret[SIM_CONTROL_STATUS_MAX])
+{
+	scenario_status(ctx, ret, SIM_CONTROL_STATUS_MAX);
+}
+
+static int start_control(struct scenario *s, uv_loop_t *loop, char error[SCENARIO_ERROR_MAX])
+{
+	char path[128], why[FAULT_ERROR_MAX];
+	struct sim_control_params params = {
+	    .socket = path, .target = s->target, .targets = 2, .ctx = s, .order = order, .status = print_status};
+	int r = 0;
+
+	s->target[0] = (struct fault_target){
+	    "laser", {s->laser.fault_kinds, s->laser_pty ? sim_pty_fault_kinds() : sim_tcp_fault_kinds()}};
+	s->target[1] = (struct fault_target){"pose", {pose_kinds, NULL}};
+	snprintf(path, sizeof path, "%.110s/simulator.sock", s->params.dir);
+	s->control = sim_control_create(loop, &params, why);
+	for (int i = 0; s->control && !r && i < s->params.faults; i++)
+		r = sim_control_order(s->control, s->params.fault[i], why);
+	if (s->control && !r)
+		return 0;
+	snprintf(error, SCENARIO_ERROR_MAX, "%s%.*s", r ? "--fault " : "", SCENARIO_ERROR_MAX - 20, why);
+	return -EINVAL;
 }
 
 static int start_poses(struct scenario *s, uv_loop_t *loop, char error[SCENARIO_ERROR_MAX])
@@ -190,7 +317,7 @@ static int start_poses(struct scenario *s, uv_loop_t *loop, char error[SCENARIO_
 /* Paths end up in a YAML file and in sockets. */
 static int check_dir(const char *dir, char error[SCENARIO_ERROR_MAX])
 {
-	if (strlen(dir) + strlen("/facetd.sock") >= ADDRESS_PATH_MAX) {
+	if (strlen(dir) + strlen("/simulator.sock") >= ADDRESS_PATH_MAX) {
 		snprintf(error, SCENARIO_ERROR_MAX,
 		         "%.120s...: too long for a directory with sockets (their paths have less than %d bytes); give "
 		         "a shorter --dir",
@@ -208,6 +335,18 @@ static int check_dir(const char *dir, char error[SCENARIO_ERROR_MAX])
 	return 0;
 }
 
+static int create_stage(const struct scenario_params *params, struct stage *ret, char error[SCENARIO_ERROR_MAX])
+{
+	int r;
+
+	if (!scenario_is_world(params->name))
+		return playback_stage(params->name, params->more, params->more_n, ret, error);
+	r = drive_stage(params->name, params->seed, ret, error);
+	if (!r && params->endless)
+		drive_endless(ret);
+	return r;
+}
+
 struct scenario *scenario_create(uv_loop_t *loop, const struct scenario_params *params, char error[SCENARIO_ERROR_MAX])
 {
 	struct scenario *s = calloc(1, sizeof *s);
@@ -220,12 +359,12 @@ struct scenario *scenario_create(uv_loop_t *loop, const struct scenario_params *
 	s->params = *params;
 	s->pose_fd = -1;
 	r = check_dir(params->dir, error);
-	if (!r && scenario_is_world(params->name))
-		r = drive_stage(params->name, params->seed, &s->stage, error);
-	else if (!r)
-		r = playback_stage(params->name, params->more, params->more_n, &s->stage, error);
+	if (!r)
+		r = create_stage(params, &s->stage, error);
 	if (!r)
 		r = start_devices(s, loop, error);
+	if (!r)
+		r = start_control(s, loop, error);
 	if (!r)
 		r = start_poses(s, loop, error);
 	if (!r)
@@ -249,8 +388,11 @@ void scenario_destroy(struct scenario *s)
 		uv_close((uv_handle_t *)s->timer, free_handle);
 	else
 		free(s->timer);
-	if (s->laser)
-		sim_pty_destroy(s->laser);
+	sim_control_destroy(s->control);
+	if (s->laser_pty)
+		sim_pty_destroy(s->laser_pty);
+	if (s->laser_tcp)
+		sim_tcp_destroy(s->laser_tcp);
 	sim_servo_destroy(s->servo);
 	if (s->stage.destroy)
 		s->stage.destroy(s->stage.ctx);

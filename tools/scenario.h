@@ -5,9 +5,9 @@
 #ifndef FACET_TOOLS_SCENARIO_H
 #define FACET_TOOLS_SCENARIO_H
 
-#include "tools/simulator.h"
+#include "tools/sim_device.h"
 
-#define SCENARIO_ERROR_MAX 300
+#define SCENARIO_ERROR_MAX 1024
 
 /* Times are CLOCK_MONOTONIC in ns. */
 struct stage {
@@ -29,8 +29,16 @@ struct stage {
 /* 0, or -errno with one sentence. `seed` makes the range noise. */
 int drive_stage(const char *world, uint64_t seed, struct stage *ret, char error[SCENARIO_ERROR_MAX]);
 
+/* That drive goes there and back again for ever. */
+void drive_endless(struct stage *);
+
 /* `source`: "uos:DIR" or "profiles:FILE.csv"; `more`: further files of the latter. */
 int playback_stage(const char *source, char *const *more, int n, struct stage *ret, char error[SCENARIO_ERROR_MAX]);
+
+/* Which scanner: an LMS2xx on a pseudo-terminal, or a TiM571, LMS111, LMS511 on TCP. */
+enum scenario_laser { SCENARIO_LMS2XX, SCENARIO_TIM, SCENARIO_LMS1XX, SCENARIO_LMS5XX, SCENARIO_LASERS };
+/* By its driver's name, "lms2xx"; SCENARIO_LASERS: there is none. */
+enum scenario_laser scenario_laser(const char *driver);
 
 struct scenario_params {
 	const char *name;  /* "building", "hall", "uos:DIR", "profiles:FILE.csv" */
@@ -39,6 +47,11 @@ struct scenario_params {
 	const char *dir; /* absolute; exists */
 	bool fast;       /* playback without the wire's pace */
 	bool tcp_servo;  /* the servo on TCP instead of a pseudo-terminal */
+	enum scenario_laser laser;
+	bool encoder;       /* the angle comes in the scanner's telegrams (LMS1xx, LMS5xx) */
+	bool endless;       /* the drive goes there and back again until it is ended */
+	char *const *fault; /* sentences (fault.h) */
+	int faults;
 	const char *tcp; /* HOST:PORT where the daemon is to listen too, or NULL */
 	uint64_t seed;
 	void *ctx;
@@ -54,7 +67,10 @@ struct scenario *scenario_create(uv_loop_t *, const struct scenario_params *, ch
 /* Closes the devices and removes their links; the loop must run once more to let go of the timer. */
 void scenario_destroy(struct scenario *);
 
+/* What the scanner did so far, for the eye of a user: one line without its end. */
+void scenario_status(const struct scenario *, char *ret, size_t cap);
+
 /* The configuration, as it is written. The length, or -ENOSPC. */
-int scenario_yaml(const struct scenario_params *, bool sweeps, int servo_port, char *ret, size_t cap);
+int scenario_yaml(const struct scenario_params *, bool sweeps, int servo_port, int laser_port, char *ret, size_t cap);
 
 #endif

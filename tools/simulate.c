@@ -23,6 +23,7 @@
 #include "config/address.h"
 #include "tools/commands.h"
 #include "tools/scenario.h"
+#include "tools/sim_control.h"
 
 #define AFTER_MS 2000  /* what COMMAND has after the scenario's end */
 #define GRACE_MS 10000 /* from SIGTERM to SIGKILL: a daemon that writes its map needs some of it */
@@ -33,6 +34,10 @@ struct options {
 	const char *scenario, *dir, *tcp;
 	char *more[64];
 	int more_n;
+	char *fault[64];
+	int faults;
+	enum scenario_laser laser;
+	bool encoder, endless;
 	bool fast, tcp_servo;
 	double speed;
 	uint64_t seed;
@@ -56,7 +61,18 @@ struct simulation {
 
 /* ---- the command line ---- */
 
-enum { OPTION_SPEED = 256, OPTION_SEED, OPTION_FAULT, OPTION_DIR, OPTION_TCP, OPTION_HTTP, OPTION_SERVO };
+enum {
+	OPTION_SPEED = 256,
+	OPTION_SEED,
+	OPTION_FAULT,
+	OPTION_DIR,
+	OPTION_TCP,
+	OPTION_HTTP,
+	OPTION_SERVO,
+	OPTION_LASER,
+	OPTION_ENCODER,
+	OPTION_ENDLESS
+};
 
 static const struct argp_option option_list[] = {
     {"dir", OPTION_DIR, "DIR", 0,
@@ -65,7 +81,14 @@ static const struct argp_option option_list[] = {
     {"seed", OPTION_SEED, "N", 0, "of the range noise of a world (default 1)", 0},
     {"tcp", OPTION_TCP, "HOST:PORT", 0, "let the daemon listen here too, beside DIR/facetd.sock", 0},
     {"servo", OPTION_SERVO, "rtu|tcp", 0, "the servo on a pseudo-terminal (default) or on TCP", 0},
-    {"fault", OPTION_FAULT, "SPEC", 0, "not yet: faults will come later", 0},
+    {"laser", OPTION_LASER, "lms2xx|tim|lms1xx|lms5xx", 0,
+     "which scanner: a LMS2xx on a pseudo-terminal (default), or a TiM571, LMS111, LMS511 on TCP", 0},
+    {"encoder", OPTION_ENCODER, 0, 0, "the angle comes in the scanner's telegrams (lms1xx, lms5xx)", 0},
+    {"endless", OPTION_ENDLESS, 0, 0, "the drive goes there and back again until it is ended", 0},
+    {"fault", OPTION_FAULT, "SPEC", 0,
+     "DEVICE: KIND [VALUE] [at TIME] [for TIME|ever], e.g. 'laser: garbage at 3s for 2s'; may be repeated; a wrong "
+     "KIND is answered with those there are",
+     0},
     {"http", OPTION_HTTP, "HOST:PORT", 0, "not yet: the browser page will come later", 0},
     {0},
 };
@@ -98,6 +121,26 @@ static void parse_tcp(struct argp_state *state, const char *arg, struct options 
 	if (address_parse_host(arg, &address, why) < 0 || address_check_loopback(&address, why) < 0)
 		argp_error(state, "--tcp: %s", why);
 	o->tcp = arg;
+}
+
+static void parse_laser(struct argp_state *state, const char *arg, struct options *o)
+{
+	o->laser = scenario_laser(arg);
+	if (o->laser == SCENARIO_LASERS)
+		argp_error(state, "--laser: '%s' is none of lms2xx, tim, lms1xx, lms5xx", arg);
+}
+
+/* Only the form is judged here: what a device can do wrong is known when there is one. */
+static void parse_fault(struct argp_state *state, char *arg, struct options *o)
+{
+	char why[FAULT_ERROR_MAX];
+	struct sim_fault fault;
+
+	if (fault_parse(arg, &fault, why) < 0)
+		argp_error(state, "--fault: %s", why);
+	if (o->faults == (int)(sizeof o->fault / sizeof *o->fault))
+		argp_error(state, "--fault: too many of them");
+	o->fault[o->faults++] = arg;
 }
 
 static void take_argument(struct argp_state *state, char *arg, struct options *o)
@@ -135,7 +178,16 @@ static error_t parse_option(int key, char *arg, struct argp_state *state)
 			argp_error(state, "--servo: '%s' is neither rtu nor tcp", arg);
 		return 0;
 	case OPTION_FAULT:
-		argp_error(state, "--fault: not yet; faults will come later");
+		parse_fault(state, arg, o);
+		return 0;
+	case OPTION_LASER:
+		parse_laser(state, arg, o);
+		return 0;
+	case OPTION_ENCODER:
+		o->encoder = true;
+		return 0;
+	case OPTION_ENDLESS:
+		o->endless = true;
 		return 0;
 	case OPTION_HTTP:
 		argp_error(state, "--http: not yet; the browser page will come later");
@@ -163,9 +215,36 @@ static const struct argp argp = {
         "profiles:FILE.csv... (with its .pose beside it). Playback is paced by its reader and never skips a line.\n\n"
         "COMMAND runs with FACETD_CONFIG set to the configuration that reaches the devices and FACETD to the address "
         "of the "
-        "daemon. Everything ends when either ends.\n\n"
-        "  facet simulate building -- build/facetd",
+        "daemon. Everything ends when either ends. Faults are ordered while it runs at DIR/simulator.sock: a sentence "
+        "as "
+        "for --fault or `status` a line, or the same as JSON, {\"fault\": \"laser: unplug for 2s\"}; each is answered "
+        "with one line.\n\n"
+        "  facet simulate building -- build/facetd\n"
+        "  facet simulate hall --laser tim --endless --fault 'laser: unplug at 10s for 2s' -- build/facetd",
 };
+
+static void refuse(const char *why)
+{
+	fprintf(stderr, "facet: simulate: %s\n", why);
+	exit(2);
+}
+
+/* What does not go together. */
+static void check(const struct options *o)
+{
+	bool world = scenario_is_world(o->scenario);
+
+	if (world && o->speed != 1.0)
+		refuse(
+		    "a world moves continuously and the daemon's clock is real: --speed is for recorded sweeps (uos:, "
+		    "profiles:)");
+	if (!world && o->laser != SCENARIO_LMS2XX)
+		refuse("recorded sweeps are played by a LMS2xx, which waits for its reader: --laser is for worlds");
+	if (!world && o->endless)
+		refuse("recorded sweeps end: --endless is for worlds");
+	if (o->encoder && o->laser != SCENARIO_LMS1XX && o->laser != SCENARIO_LMS5XX)
+		refuse("--encoder: only lms1xx and lms5xx have inputs for one");
+}
 
 /* What is behind `--` is COMMAND's and never looked at. */
 static void parse(int argc, char **argv, struct options *ret)
@@ -182,12 +261,7 @@ static void parse(int argc, char **argv, struct options *ret)
 	}
 	if (own < argc)
 		ret->command = argv + own + 1;
-	if (scenario_is_world(ret->scenario) && ret->speed != 1.0) {
-		fprintf(stderr,
-		        "facet: simulate: a world moves continuously and the daemon's clock is real: --speed is for "
-		        "recorded sweeps (uos:, profiles:)\n");
-		exit(2);
-	}
+	check(ret);
 }
 
 /* ---- the directory ---- */
@@ -401,9 +475,18 @@ static void say_where(const struct simulation *s, const struct options *o)
 	printf("address unix:%s/facetd.sock\n", s->dir);
 	if (o->tcp)
 		printf("address tcp:%s\n", o->tcp);
+	printf("faults are ordered at %s/simulator.sock\n", s->dir);
 }
 
-static int simulate(struct simulation *s, const struct options *o)
+static void say_status(const struct simulation *s)
+{
+	char status[SIM_CONTROL_STATUS_MAX];
+
+	scenario_status(s->scenario, status, sizeof status);
+	puts(status);
+}
+
+static int simulate(struct simulation *s, struct options *o)
 {
 	struct scenario_params params = {.name = o->scenario,
 	                                 .more = o->more,
@@ -411,6 +494,11 @@ static int simulate(struct simulation *s, const struct options *o)
 	                                 .dir = s->dir,
 	                                 .fast = o->fast,
 	                                 .tcp_servo = o->tcp_servo,
+	                                 .laser = o->laser,
+	                                 .encoder = o->encoder,
+	                                 .endless = o->endless,
+	                                 .fault = o->fault,
+	                                 .faults = o->faults,
 	                                 .tcp = o->tcp,
 	                                 .seed = o->seed,
 	                                 .ctx = s,
@@ -430,6 +518,7 @@ static int simulate(struct simulation *s, const struct options *o)
 	}
 	while (!s->over)
 		uv_run(&s->loop, UV_RUN_DEFAULT);
+	say_status(s);
 	return s->status;
 }
 

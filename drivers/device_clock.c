@@ -5,7 +5,7 @@
  * idea of how delays are distributed. The window is some thousand stamps long, but a late point can never belong to the
  * hull if an earlier and a later one lie below: one point an interval is kept, the least delayed, 64 intervals make the
  * window. Intervals begin short, so that a young clock has points too, and are joined in pairs until they are as long as
- * a window needs: a minute for a crystal, whose rate is steady, eight seconds for a motor, whose rate is not.
+ * a window needs: a minute for a crystal, whose rate is steady, sixteen seconds for a motor, whose rate is less so.
  *
  * How often a counter came round is told by the arrival: the stamp lies at or before it, by less than three quarters of
  * a turn. Where the drift leaves that open (a mirror's 256 turns, nothing heard for 40 s), the clock begins anew.
@@ -26,7 +26,7 @@
 
 #define MS             1000000ll
 #define WINDOW_NS      (64000 * MS) /* of a crystal */
-#define WINDOW_MOTOR   (8000 * MS)
+#define WINDOW_MOTOR   (16000 * MS)
 #define MOTOR          1e-3 /* drift of more than this is no crystal's */
 #define FIRST_PART     16   /* the first intervals are so much shorter than the last */
 #define SURPRISE_NS    (20 * MS)

@@ -34,7 +34,7 @@
 #define AHEAD_TDEG  900000 /* SICK's 90 degrees are straight ahead */
 #define TURN_TDEG   3600000
 #define RATE_MIN    100 /* of the mirror, 1/100 Hz: what is beyond was not meant */
-#define RATE_MAX    20000
+#define RATE_MAX    60000
 #define SENDING_US  1000000 /* no device holds a scan back for so long; and none sends it before it is there */
 #define SCALE_MAX   100.0
 #define OFFSET_MAX  1e6 /* mm */

@@ -110,7 +110,7 @@ static void check_words(const struct decoder *d)
 	cola_counters(d, &counters);
 	must(counters.n > 0 && counters.n <= DECODER_COUNTERS_MAX);
 	cola_timing(d, &timing);
-	must(timing.known && timing.expected_hz >= 0 && timing.expected_hz <= 200);
+	must(timing.known && timing.expected_hz >= 0 && timing.expected_hz <= 600);
 }
 
 /* The decoder is replaced by one that was filled from its snapshot. */

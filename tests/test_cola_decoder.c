@@ -434,7 +434,7 @@ static void a_rate_or_stamp_beyond_belief_is_counted_and_the_last_one_kept(void 
 	next_scan(rig, &s, 1);
 	feed_scan(rig, &s, 1000, 0);
 	assert_int_equal(rig->last.turn_ns, 20000000);
-	s.frequency_chz = 20001;
+	s.frequency_chz = 60001;
 	next_scan(rig, &s, 1);
 	feed_scan(rig, &s, 1000, 0);
 	assert_int_equal(rig->last.turn_ns, 20000000);

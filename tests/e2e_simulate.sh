@@ -36,7 +36,14 @@ gone() { # no process has this text in its command line
 timeout 30 "$facet" simulate --help | grep -q 'profiles:FILE.csv' || fail "--help does not say how sweeps are played"
 refused 2 'which scenario'
 refused 2 'one word too many' hall kitchen
-refused 2 '--fault: not yet' hall --fault noise
+refused 2 'no colon behind the device' hall --fault noise
+refused 2 'wants a time' hall --fault 'laser: garbage for'
+refused 1 "'smoke': laser has no such fault; it has .*crc.*unplug" hall --fault 'laser: smoke'
+refused 1 "'radar': no such device; there is laser, pose" hall --fault 'radar: garbage'
+refused 2 'none of lms2xx, tim, lms1xx, lms5xx' hall --laser radar
+refused 2 'only lms1xx and lms5xx' hall --laser tim --encoder
+refused 2 '--laser is for worlds' uos:/nowhere --laser tim
+refused 2 '--endless is for worlds' uos:/nowhere --endless
 refused 2 '--http: not yet' hall --http 127.0.0.1:1
 refused 2 'world moves continuously' hall --speed 2
 refused 2 'world moves continuously' building --speed max
@@ -84,20 +91,70 @@ wait $simulate
 gone deaf-7772 || fail "a COMMAND that ignores SIGTERM outlived it"
 [ ! -e "$out/stopped/servo" ] || fail "a link was left after SIGTERM"
 
-# The real thing, short: the hall through facetd into a mesh
-cat >"$out/map.sh" <<MAP
-"$build/facetd" 2>"$out/facetd.log" & daemon=\$!
-for i in \$(seq 60); do
+# The real thing, short: the hall through facetd into a mesh, with every scanner
+cat >"$out/map.sh" <<'MAP'
+"$build/facetd" 2>"$out/$laser.log" & daemon=$!
+for i in $(seq 60); do
     sleep 1
-    "$facet" save -o "$out/hall.ply" >"$out/save.log" 2>&1 && [ "\$(sed -n 's/.*step \([0-9]*\),.*/\1/p' "$out/save.log")" -gt 150 ] && break
+    "$facet" save -o "$out/$laser.ply" >"$out/$laser.save" 2>&1 && [ "$(sed -n 's/.*step \([0-9]*\),.*/\1/p' "$out/$laser.save")" -gt "$steps" ] && break
 done
-kill -TERM \$daemon
-wait \$daemon
+kill -TERM $daemon
+wait $daemon
 MAP
-timeout 120 "$facet" simulate hall -- sh "$out/map.sh" >/dev/null || fail "facetd did not end well: $(tail -n 3 "$out/facetd.log")"
-faces=$(sed -n 's/.*, \([0-9]*\) faces.*/\1/p' "$out/save.log")
-[ "${faces:-0}" -gt 2000 ] || fail "the hall has no mesh: $(cat "$out/save.log" "$out/facetd.log")"
-echo "note: the hall after a few seconds: $(sed 's/^[^:]*: //' "$out/save.log")"
+export build facet out laser steps
+
+# map LASER STEPS FACES [OPTIONS...]: after so many steps the hall has more than so many faces
+map() {
+    laser=$1 steps=$2 faces=$3
+    shift 3
+    timeout 120 "$facet" simulate hall --endless "$@" -- sh "$out/map.sh" >"$out/$laser.said" || fail "$laser: facetd did not end well: $(tail -n 3 "$out/$laser.log")"
+    made=$(sed -n 's/.*, \([0-9]*\) faces.*/\1/p' "$out/$laser.save")
+    [ "${made:-0}" -gt "$faces" ] || fail "$laser: the hall has no mesh: $(cat "$out/$laser.save" "$out/$laser.log")"
+    grep -q '^laser: profiles [1-9]' "$out/$laser.said" || fail "$laser: what the scanner did is not said"
+    echo "note: the hall, $laser, after a few seconds: $(sed 's/^[^:]*: //' "$out/$laser.save")"
+}
+map lms2xx 150 2000
+map tim 60 2000 --laser tim
+map lms1xx 150 2000 --laser lms1xx
+map lms5xx 80 2000 --laser lms5xx --encoder
+
+# Faults: ordered by the command line and at the socket, seen by the daemon, and recovered from
+cat >"$out/faults.sh" <<'FAULTS'
+"$build/facetd" 2>"$out/faults.log" & daemon=$!
+streams() { # so many times the laser began to stream
+    for i in $(seq 300); do
+        [ "$(grep -c 'laser: streaming' "$out/faults.log")" -ge "$1" ] && return 0
+        sleep 0.1
+    done
+    echo "it did not stream for the time number $1"
+}
+streams 1
+streams 2
+python3 - "${FACETD#unix:}" <<'ORDERS'
+import os, socket, sys
+s = socket.socket(socket.AF_UNIX)
+s.connect(os.path.join(os.path.dirname(sys.argv[1]), "simulator.sock"))
+f = s.makefile("rw")
+for line in "laser: smoke", '{"fault": "laser: power for 500ms"}', "status", '{"status": true}':
+    f.write(line + "\n")
+    f.flush()
+    print(f.readline().strip())
+ORDERS
+streams 3
+kill -TERM $daemon
+wait $daemon
+FAULTS
+for laser in lms2xx tim; do
+    timeout 120 "$facet" simulate hall --endless --laser $laser --fault 'laser: unplug at 2s for 2s' --fault 'laser: garbage at 1s for 200ms' -- sh "$out/faults.sh" >"$out/faults.said"
+    ! grep 'did not stream' "$out/faults.said" || fail "$laser does not come back: $(cat "$out/faults.log")"
+    grep -q 'laser: lost' "$out/faults.log" || fail "$laser: facetd does not say that it lost the scanner"
+    grep -q "^error: 'smoke': laser has no such fault; it has" "$out/faults.said" || fail "a wrong order is not refused"
+    grep -q '^{"ok":true}$' "$out/faults.said" || fail "an order in JSON is not taken"
+    grep -q '^laser: profiles [1-9]' "$out/faults.said" || fail "the status is not said"
+    grep -q '^{"ok":true,"status":"laser: profiles' "$out/faults.said" || fail "the status is not said in JSON"
+    grep -q 'garbage [1-9][0-9]* bytes' "$out/faults.said" || fail "$laser: no garbage was sent: $(tail -n 1 "$out/faults.said")"
+    echo "note: faults, $laser: $(tail -n 1 "$out/faults.said")"
+done
 
 [ "$failures" -eq 0 ] && echo "all well"
 exit $((failures > 0))

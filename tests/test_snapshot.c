@@ -8,7 +8,9 @@
 #include <cmocka.h>
 
 #include "tests/cola_telegrams.h"
-#include "tests/session.h"
+#include "drivers/clock_filter.h"
+#include "drivers/device_clock.h"
+#include "tests/fuzz_state.h"
 
 enum { SNAPSHOT_MAX = 4 << 20, ROWS_MAX = 1 << 16, EVERY = 3 };
 
@@ -163,16 +165,23 @@ static void check(struct session *s, const char *name)
 	session_finish(s);
 }
 
-static void lms2xx_session(const char *laser, uint64_t seed, bool indices, double seconds)
+static void keep_lms2xx(struct session *s, const char *laser, uint64_t seed, bool indices, double seconds)
 {
-	struct session s = {.random = seed};
-	const struct scene scene = {.ctx = &s, .scan = session_scan};
+	const struct scene scene = {.ctx = s, .scan = session_scan};
 	const struct sim_lms2xx_params params = {.baud = 38400, .mode = 0x05, .millimetres = true, .indices = indices};
 	struct sim_device brain;
 
-	session_configure(&s, laser);
+	*s = (struct session){.random = seed};
+	session_configure(s, laser);
 	assert_int_equal(sim_lms2xx_create(&params, &scene, SESSION_START_NS, &brain), 0);
-	session_run(&s, brain, seconds);
+	session_run(s, brain, seconds);
+}
+
+static void lms2xx_session(const char *laser, uint64_t seed)
+{
+	struct session s;
+
+	keep_lms2xx(&s, laser, seed, seed == 2, 14);
 	assert_true(s.streams >= 3); /* it streamed, was cut off, and streamed again */
 	check(&s, laser);
 }
@@ -180,8 +189,8 @@ static void lms2xx_session(const char *laser, uint64_t seed, bool indices, doubl
 static void an_lms2xx_session_goes_on_from_any_snapshot(void **state)
 {
 	(void)state;
-	lms2xx_session("driver: lms2xx, port: /dev/null, baud: 500000, variant: 180/0.5, tilt: servo", 1, false, 14);
-	lms2xx_session("driver: lms2xx, port: /dev/null, baud: 500000, variant: 180/0.25, tilt: servo", 2, false, 14);
+	lms2xx_session("driver: lms2xx, port: /dev/null, baud: 500000, variant: 180/0.5, tilt: servo", 1);
+	lms2xx_session("driver: lms2xx, port: /dev/null, baud: 500000, variant: 180/0.25, tilt: servo", 2);
 }
 
 /* A scanner that sends and never answers: its telegrams are all that its decoder remembers. Scans are lost now and then, its
@@ -245,10 +254,9 @@ static void talker_destroy(void *ctx)
 	(void)ctx;
 }
 
-static void cola_session(const char *laser, enum cola_dialect dialect, int encoders, double seconds)
+static void keep_cola(struct session *s, const char *laser, enum cola_dialect dialect, int encoders, double seconds)
 {
-	struct session s = {.random = (uint64_t)dialect + 7};
-	struct talker talker = {.s = &s, .dialect = dialect, .scan = telegram_tim(), .period_ns = 20000000};
+	struct talker talker = {.s = s, .dialect = dialect, .scan = telegram_tim(), .period_ns = 20000000};
 	const struct sim_device brain = {.ctx = &talker,
 	                                 .receive = talker_receive,
 	                                 .advance = talker_advance,
@@ -259,25 +267,190 @@ static void cola_session(const char *laser, enum cola_dialect dialect, int encod
 	talker.start_us = UINT32_MAX - 3000000 - 0x40000000;
 	talker.scan.frequency_chz = 5000;
 	talker.scan.encoders = encoders;
-	session_configure(&s, laser);
-	session_run(&s, brain, seconds);
+	*s = (struct session){.random = (uint64_t)dialect + 7};
+	session_configure(s, laser);
+	session_run(s, brain, seconds);
+}
+
+static void cola_session(const char *laser, enum cola_dialect dialect, int encoders)
+{
+	struct session s;
+
+	keep_cola(&s, laser, dialect, encoders, 9);
 	check(&s, laser);
 }
 
 static void a_cola_session_goes_on_from_any_snapshot(void **state)
 {
 	(void)state;
-	cola_session("driver: tim, connect: 192.168.0.1, tilt: servo", COLA_A, 0, 9);
-	cola_session("driver: lms1xx, connect: 192.168.0.1, tilt: servo", COLA_B, 0, 9);
-	cola_session("driver: lms5xx, connect: 192.168.0.1, tilt: laser, encoder: {scale: 0.001}", COLA_B, 1, 9);
+	cola_session("driver: tim, connect: 192.168.0.1, tilt: servo", COLA_A, 0);
+	cola_session("driver: lms1xx, connect: 192.168.0.1, tilt: servo", COLA_B, 0);
+	cola_session("driver: lms5xx, connect: 192.168.0.1, tilt: laser, encoder: {scale: 0.001}", COLA_B, 1);
 }
 
-int main(void)
+/* Seeds for fuzz_state: small snapshots, and what comes after them. */
+
+static void write_seed(const char *dir, const char *name, int which, const struct state *s, const void *rest,
+                       size_t len)
+{
+	const uint8_t head[3] = {(uint8_t)which, (uint8_t)s->at, (uint8_t)(s->at >> 8)};
+	char path[512];
+	FILE *file;
+
+	assert_true(state_done(s) && s->at < 65536);
+	snprintf(path, sizeof path, "%s/%s", dir, name);
+	file = fopen(path, "wb");
+	assert_non_null(file);
+	fwrite(head, 1, sizeof head, file);
+	fwrite(s->bytes, 1, s->at, file);
+	fwrite(rest, 1, len, file);
+	fclose(file);
+}
+
+static void ignore_profile(void *ctx, int device, const struct profile *profile)
+{
+	(void)ctx;
+	(void)device;
+	(void)profile;
+}
+
+static void ignore_tilt(void *ctx, int device, const struct tilt *tilt)
+{
+	(void)ctx;
+	(void)device;
+	(void)tilt;
+}
+
+static void ignore_pose(void *ctx, int device, const struct pose *pose)
+{
+	(void)ctx;
+	(void)device;
+	(void)pose;
+}
+
+static void seed_of_device(const char *dir, const struct session *s, int from, int which, size_t cut)
+{
+	const struct driver *driver = driver_find(s->config.device[from].driver);
+	struct decoder *decoder = driver->decoder_create(&s->config.device[from], from);
+	const struct record_sink sink = {.profile = ignore_profile, .tilt = ignore_tilt, .pose = ignore_pose};
+	static uint8_t bytes[SNAPSHOT_MAX], rest[4096];
+	size_t at = 0, len = 0;
+	struct state state;
+	char name[64];
+
+	for (; at < cut; at++)
+		if (s->entry[at].kind == ENTRY_RECORD && s->entry[at].record.device == from)
+			driver->decode(decoder, &s->entry[at].record, &sink);
+	state_save(&state, bytes, sizeof bytes);
+	driver->state(decoder, &state);
+	for (; at < s->entries && len < 1500; at++) {
+		const struct record *record = &s->entry[at].record;
+		const size_t pieces = (record->len + 15) / 16;
+
+		if (s->entry[at].kind != ENTRY_RECORD || record->device != from || pieces > 63)
+			continue;
+		rest[len++] = (uint8_t)(pieces | (size_t)record->direction << 6);
+		memset(rest + len, 0, 16 * pieces);
+		memcpy(rest + len, record->bytes, record->len);
+		len += 16 * pieces;
+	}
+	snprintf(name, sizeof name, "%s-%zu", s->config.device[from].driver, cut);
+	write_seed(dir, name, which, &state, rest, len);
+	driver->decoder_destroy(decoder);
+}
+
+static void seeds_of_sweep(const char *dir, bool fixed)
+{
+	static const uint8_t rest[] = {0x40, 0x41, 0x82, 0x44, 0x45, 0x06, 0x48, 0x49, 0x0e, 0x16, 0x1e, 0x4c,
+	                               0x4d, 0x02, 0x12, 0x50, 0x51, 0x54, 0x55, 0xf2, 0xf6, 0x58, 0x59};
+	static struct profile profile;
+	static uint8_t bytes[SNAPSHOT_MAX];
+
+	for (int n = 0; n < 12; n += 3) {
+		struct sweep *sweep = sweep_create(fuzz_state_params(fixed));
+		const int64_t t_ns = FUZZ_STATE_T_NS - 50 * SESSION_STEP_NS;
+		struct row *row = NULL;
+		enum sweep_drop drop;
+		struct state state;
+		char name[64];
+
+		for (int i = 0; i < n; i++) {
+			sweep_tilt(sweep, &(struct tilt){t_ns + i * SESSION_STEP_NS, 0.01 * i});
+			sweep_pose(sweep, &(struct pose){t_ns + i * SESSION_STEP_NS, {0.01 * i, 0, 0}, {1, 0, 0, 0}});
+		}
+		for (int i = 0; i < n; i++)
+			sweep_profile(sweep,
+			              fuzz_state_profile(&profile, t_ns + (3 + i) * SESSION_STEP_NS, (uint8_t)(4 + i)),
+			              t_ns + 20 * SESSION_STEP_NS);
+		if (n > 0 && sweep_next(sweep, t_ns + 60 * SESSION_STEP_NS, false, &row, &drop) == SWEEP_ROW)
+			row_destroy(row);
+		state_save(&state, bytes, sizeof bytes);
+		sweep_state(&state, sweep);
+		snprintf(name, sizeof name, "sweep-%d-%d", fixed, n);
+		write_seed(dir, name, fixed ? FUZZ_STATE_SWEEP_FIXED : FUZZ_STATE_SWEEP, &state, rest, sizeof rest);
+		sweep_destroy(sweep);
+	}
+}
+
+static void seeds_of_clocks(const char *dir)
+{
+	static const uint8_t rest[] = {66, 66, 67, 66, 65, 66, 133, 66, 66, 0, 66, 255, 255, 66, 66, 3, 66, 66, 66};
+	static uint8_t bytes[SNAPSHOT_MAX];
+	struct clock_filter filter;
+	struct device_clock clock;
+	struct state state;
+
+	clock_filter_init(&filter, FUZZ_STATE_TURN_NS);
+	device_clock_init(&clock, 1000, INT64_C(1) << 32, 500e-6);
+	for (int i = 0; i < 20; i++) {
+		const int64_t t_ns = FUZZ_STATE_T_NS - (40 - i) * FUZZ_STATE_TURN_NS;
+
+		clock_filter_stamp(&filter, t_ns + i % 3 * 1000000, 1);
+		device_clock_stamp(&clock, (uint32_t)(i * 13333), t_ns + i % 3 * 1000000);
+		if (i % 10 != 9)
+			continue;
+		state_save(&state, bytes, sizeof bytes);
+		clock_filter_state(&state, &filter);
+		write_seed(dir, i < 10 ? "filter-10" : "filter-20", FUZZ_STATE_FILTER, &state, rest, sizeof rest);
+		state_save(&state, bytes, sizeof bytes);
+		device_clock_state(&state, &clock);
+		write_seed(dir, i < 10 ? "clock-10" : "clock-20", FUZZ_STATE_CLOCK, &state, rest, sizeof rest);
+	}
+}
+
+static int write_seeds(const char *dir)
+{
+	struct session s;
+
+	keep_lms2xx(&s, "driver: lms2xx, port: /dev/null, baud: 500000, variant: 180/0.5, tilt: servo", 1, true, 6);
+	for (size_t cut = 0; cut < s.entries; cut += s.entries / 4) {
+		seed_of_device(dir, &s, SESSION_LASER, FUZZ_STATE_LASER, cut);
+		seed_of_device(dir, &s, SESSION_SERVO, FUZZ_STATE_SERVO, cut);
+		seed_of_device(dir, &s, SESSION_POSE, FUZZ_STATE_POSE, cut);
+	}
+	session_finish(&s);
+	keep_cola(&s, "driver: tim, connect: 192.168.0.1, tilt: servo", COLA_A, 0, 3);
+	for (size_t cut = 0; cut < s.entries; cut += s.entries / 4)
+		seed_of_device(dir, &s, SESSION_LASER, FUZZ_STATE_TIM, cut);
+	session_finish(&s);
+	keep_cola(&s, "driver: lms5xx, connect: 192.168.0.1, tilt: laser, encoder: {scale: 0.001}", COLA_B, 1, 3);
+	for (size_t cut = 0; cut < s.entries; cut += s.entries / 4)
+		seed_of_device(dir, &s, SESSION_LASER, FUZZ_STATE_LMS5XX, cut);
+	session_finish(&s);
+	seeds_of_sweep(dir, false);
+	seeds_of_sweep(dir, true);
+	seeds_of_clocks(dir);
+	return 0;
+}
+
+int main(int argc, char **argv)
 {
 	const struct CMUnitTest tests[] = {
 	    cmocka_unit_test(an_lms2xx_session_goes_on_from_any_snapshot),
 	    cmocka_unit_test(a_cola_session_goes_on_from_any_snapshot),
 	};
 
+	if (argc == 3 && strcmp(argv[1], "seeds") == 0)
+		return write_seeds(argv[2]);
 	return cmocka_run_group_tests(tests, NULL, NULL);
 }

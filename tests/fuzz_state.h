@@ -30,7 +30,7 @@ static inline void fuzz_state_configure(struct session *s)
 		session_configure(&others, "driver: tim, connect: 192.168.0.1, tilt: servo");
 		s->config.device[FUZZ_STATE_TIM] = others.config.device[0];
 		session_configure(&others,
-		                  "driver: lms5xx, connect: 192.168.0.1, tilt: laser, encoder: {scale: 0.001}");
+		                  "driver: lms5xx, connect: 192.168.0.1, tilt: laser, encoder: {scale: 0.0001}");
 		s->config.device[FUZZ_STATE_LMS5XX] = others.config.device[0];
 		s->config.devices = FUZZ_STATE_SWEEP;
 	}

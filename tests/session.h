@@ -187,12 +187,35 @@ static inline void session_open(struct session *s, int device)
 	session_record(s, device, LINK_OPENED, NULL, 0);
 }
 
+static inline void session_fault(struct session *s, const char *kind, double value, bool on)
+{
+	struct sim_fault fault = {.value = value, .for_ns = INT64_MAX};
+
+	snprintf(fault.kind, sizeof fault.kind, "%s", kind);
+	if (!s->brain.fault(s->brain.ctx, &fault, on, s->t_ns))
+		abort();
+}
+
+/* Ragged arrivals, a backlog, telegrams that never come, a power cycle. */
+static inline void session_trouble(struct session *s, int64_t step, int64_t steps)
+{
+	if (step == steps / 5 || step == steps * 2 / 5)
+		session_fault(s, "jitter", 8, step == steps / 5);
+	if (step == steps * 2 / 5 || step == steps * 2 / 5 + 150)
+		session_fault(s, "stall", 0, step == steps * 2 / 5);
+	if (step == steps * 9 / 20 || step == steps * 9 / 20 + 60)
+		session_fault(s, "silence", 0, step == steps * 9 / 20);
+	if (step == steps * 4 / 5 || step == steps * 4 / 5 + 300)
+		session_fault(s, "power", 0, step == steps * 4 / 5);
+}
+
 static inline void session_step(struct session *s, int64_t step, int64_t steps)
 {
 	if (step == 0 || step == steps / 2)
 		session_open(s, SESSION_LASER);
 	if (step == 0 || step == steps * 3 / 4)
 		session_open(s, SESSION_SERVO);
+	session_trouble(s, step, steps);
 	if (step == steps * 5 / 8) {
 		s->ahead_ns = 3600 * INT64_C(1000000000);
 		session_keep(s, (struct session_entry){.kind = ENTRY_CLOCK, .ns = s->ahead_ns});

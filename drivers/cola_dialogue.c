@@ -731,7 +731,7 @@ void cola_dialogue_reply(struct dialogue *d, const struct reply *reply)
 
 void cola_dialogue_data(struct dialogue *d, int64_t t_ns)
 {
-	if (d->stage == STAGE_STREAMING)
+	if (d->stage == STAGE_STREAMING && t_ns > d->heard_ns) /* several came at once: one, as far as time goes */
 		d->interval_ns[d->intervals++ % PERIODS] = t_ns - d->heard_ns;
 	d->heard = true;
 	d->heard_ns = t_ns;

@@ -308,8 +308,8 @@ static bool is_sane(const struct cola_channel *c)
 	return turns && starts && scales;
 }
 
-/* The angle nearest to 0 that the ticks may mean. They are latched when a scan starts. */
-static void take_encoder(struct decoder *d, const struct cola_scan *s, int64_t start_ns, const struct record_sink *sink)
+/* The angle nearest to 0 that the ticks may mean. They are read when the scan is stamped, be that its start or its end. */
+static void take_encoder(struct decoder *d, const struct cola_scan *s, int64_t stamp_ns, const struct record_sink *sink)
 {
 	const double wrap = d->config.encoder.wrap > 0 ? d->config.encoder.wrap : (double)WRAP;
 	double ticks = s->encoder[0].ticks - d->config.encoder.zero;
@@ -318,7 +318,8 @@ static void take_encoder(struct decoder *d, const struct cola_scan *s, int64_t s
 		return;
 	ticks -= wrap * floor(ticks / wrap + 0.5);
 	const double sign = d->config.encoder.sign < 0 ? -1 : 1;
-	const struct tilt tilt = {.t_ns = start_ns, .angle_rad = sign * d->config.encoder.scale * ticks};
+	const struct tilt tilt = {.t_ns = stamp_ns - d->config.latency_ns,
+	                          .angle_rad = sign * d->config.encoder.scale * ticks};
 	d->count[TILTS]++;
 	sink->tilt(sink->ctx, d->device, &tilt);
 }
@@ -335,7 +336,7 @@ static void take_profile(struct decoder *d, const struct cola_scan *s, int64_t s
 		d->count[MALFORMED]++;
 	} else {
 		fill_profile(d, c, stamp_ns);
-		take_encoder(d, s, d->profile.t_ns, sink);
+		take_encoder(d, s, stamp_ns, sink);
 		d->count[PROFILES]++;
 		sink->profile(sink->ctx, d->device, &d->profile);
 	}

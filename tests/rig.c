@@ -173,6 +173,11 @@ static double tilt_at(const struct rig *r, int64_t t_ns)
 	return from + (way > length ? 2 * length - way : way);
 }
 
+double rig_tilt(const struct rig *r, int64_t t_ns)
+{
+	return tilt_at(r, t_ns);
+}
+
 static struct transform laser_at(struct scanner *s, int64_t t_ns)
 {
 	struct transform base = base_at(s->rig, t_ns);

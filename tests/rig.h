@@ -50,7 +50,8 @@ int rig_find(const struct rig *, const char *device); /* its index */
 
 /* What the device sees: for its brain. */
 void rig_scene(struct rig *, const char *device, struct scene *ret);
-int64_t rig_epoch_ns(const struct rig *); /* brains are made with this time */
+int64_t rig_epoch_ns(const struct rig *);          /* brains are made with this time */
+double rig_tilt(const struct rig *, int64_t t_ns); /* the true angle of the servo, at a brain's time */
 /* The device's other end; the brain is the rig's from now on. */
 void rig_attach(struct rig *, const char *device, enum rig_transport, const struct sim_device *brain);
 

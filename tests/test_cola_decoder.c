@@ -451,7 +451,7 @@ static void a_rate_or_stamp_beyond_belief_is_counted_and_the_last_one_kept(void 
 	assert_int_equal(rig->profiles, 5);
 }
 
-static void encoder_ticks_are_the_tilt_at_the_start_of_the_scan(void **state)
+static void encoder_ticks_are_the_tilt_when_the_scan_was_stamped(void **state)
 {
 	struct rig *rig = *state;
 	struct cola_scan s = telegram_tim();
@@ -469,6 +469,12 @@ static void encoder_ticks_are_the_tilt_at_the_start_of_the_scan(void **state)
 	assert_int_equal(rig->tilts, 1);
 	assert_true(rig->tilt_came_first);
 	assert_true(fabs(rig->tilt.angle_rad + 0.1) < 1e-12);
+	const int64_t sweep_ns = (int64_t)(rig->last.n - 1) * rig->last.beam_ns; /* the beam's time is rounded */
+	assert_true(llabs(rig->tilt.t_ns - (rig->last.t_ns + sweep_ns)) < rig->last.n);
+	rig->config.stamp = STAMP_START;
+	rig->config.latency_ns = 3 * MS;
+	open_as(rig, "lms1xx");
+	feed_scan(rig, &s, 1000, 0);
 	assert_int_equal(rig->tilt.t_ns, rig->last.t_ns);
 	static const struct {
 		uint32_t ticks;
@@ -619,7 +625,7 @@ int main(void)
 	    RIGGED(a_telegram_sent_twice_is_one_profile),
 	    RIGGED(what_cannot_be_a_profile_is_counted_and_dropped),
 	    RIGGED(a_rate_or_stamp_beyond_belief_is_counted_and_the_last_one_kept),
-	    RIGGED(encoder_ticks_are_the_tilt_at_the_start_of_the_scan),
+	    RIGGED(encoder_ticks_are_the_tilt_when_the_scan_was_stamped),
 	    RIGGED(answers_go_to_the_dialogue_with_their_dialect),
 	    RIGGED(errors_of_the_device_and_of_the_wire_are_counted),
 	    RIGGED(a_snapshot_goes_on_in_mid_telegram_and_a_broken_one_is_as_new),

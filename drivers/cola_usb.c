@@ -43,7 +43,7 @@
 #define INS            4
 #define IN_BYTES       65536
 #define OUT_BYTES      1024
-#define IN_TIMEOUT_MS  500
+#define IN_TIMEOUT_MS  400 /* below the patience of whoever waits for an answer, above four scans at 15 Hz */
 #define OUT_TIMEOUT_MS 1000
 #define HALTS_MAX      3 /* running, without a byte between */
 #define CLOSE_TURNS    10

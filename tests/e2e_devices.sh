@@ -37,11 +37,15 @@ has "$scratch/many" "/dev/ttyUSB0, FTDI FT232R USB UART, 0403:6001, serial numbe
 has "$scratch/many" "port: '/dev/serial/by-id/usb-FTDI_FT232R_USB_UART_A5XK3RJT-if00-port0', baud: 500000}"
 has "$scratch/many" "! the adapter holds bytes back for 16 ms"
 has "$scratch/many" "port: '/dev/ttyUSB1', baud: 500000}"
-has "$scratch/many" "! no name in /dev/serial/by-id"
+has "$scratch/many" "! it has no name of its own: after the next plugging its twin may be /dev/ttyUSB1"
+"$bed" --adapter ttyUSB7= -- "$build/facet" devices >"$scratch/alone" 2>&1
+has "$scratch/alone" "port: 'usb:0403:6001', baud: 500000}"
 
 # The lines, pasted as they stand.
-{ echo "devices:"; grep '^ *- {' "$scratch/many"; } >"$scratch/pasted.yaml"
+{ echo "devices:"; grep -h '^ *- {' "$scratch/many"; } >"$scratch/pasted.yaml"
 [ "$(wc -l <"$scratch/pasted.yaml")" -eq 5 ] || fail "not four lines to paste"
+{ echo "devices:"; grep '^ *- {' "$scratch/alone"; } >"$scratch/alone.yaml"
+"$build/facetd" --check-config --config "$scratch/alone.yaml" || fail "what is pasted is no right configuration"
 "$build/facetd" --check-config --config "$scratch/pasted.yaml" || fail "what is pasted is no right configuration"
 grep -- '- {name: laser, driver: lms1xx' "$scratch/many" | sed 's/.*looked for: /devices: [/; s/- {/{/; s/}$/}]/' >"$scratch/ethernet.yaml"
 "$build/facetd" --check-config --config "$scratch/ethernet.yaml" || fail "the line for Ethernet is no right configuration"

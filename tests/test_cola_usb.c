@@ -307,6 +307,7 @@ static void a_halt_is_cleared_and_the_stream_goes_on(void **state)
 		assert_memory_equal(got, "beforebehind", 12);
 	}
 	assert_int_equal(scanner.count.halts_cleared, 10);
+	assert_int_equal(scanner.count.cleared_in_flight, 0);
 	cola_usb.close(link);
 }
 

@@ -38,7 +38,8 @@ struct usbfs_piece { /* what the device sends next */
 };
 
 struct usbfs_counts {
-	int clients, claims, detached, submitted, flying_peak, halts_cleared, discarded, released, empty_packets;
+	int clients, claims, detached, submitted, flying_peak, halts_cleared, cleared_in_flight, discarded, released,
+	    empty_packets;
 };
 
 struct usbfs {
@@ -231,6 +232,7 @@ static inline int usbfs_clear_halt(struct usbfs *u)
 	if (u->gone)
 		return ENODEV;
 	u->count.halts_cleared++;
+	u->count.cleared_in_flight += u->ins; /* controllers do not agree about what becomes of those */
 	u->halted = u->halt_on_clear > 0;
 	u->halt_on_clear -= u->halted;
 	return 0;

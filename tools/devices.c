@@ -121,18 +121,18 @@ static void interface_driver(const char *port, char ret[32])
 
 /* Finding */
 
-static void name_device(int number, char ret[16])
+static void name_device(int number, char ret[24])
 {
 	if (number == 0)
-		snprintf(ret, 16, "laser");
+		snprintf(ret, 24, "laser");
 	else
-		snprintf(ret, 16, "laser%d", number + 1);
+		snprintf(ret, 24, "laser%d", number + 1);
 }
 
 static void describe_usb(const struct usb_device *list, int n, int i, int number, struct found *ret)
 {
 	const struct usb_device *device = &list[i];
-	char name[16], driver[32], why[160];
+	char name[24], driver[32], why[160];
 
 	memset(ret, 0, sizeof(*ret));
 	*ret = (struct found){.kind = "usb",
@@ -168,9 +168,32 @@ static int usual_baud(const struct serial_line *line)
 	return line->vendor ? 500000 : 38400;
 }
 
-static void describe_serial(const struct serial_line *line, int number, struct found *ret)
+/* What stays with the adapter: udev's name for it, else its make and number where they are unique, else the node. */
+static void name_port(const struct serial_line *list, int n, const struct serial_line *line, char ret[256])
 {
-	char name[16], why[160];
+	const char *digits = "0123456789abcdefghijklmnopqrstuvwxyzABCDEFGHIJKLMNOPQRSTUVWXYZ-_.";
+	int same = 0, twins = 0;
+
+	for (int i = 0; i < n; i++) {
+		bool make = list[i].vendor == line->vendor && list[i].product == line->product;
+
+		same += make;
+		twins += make && strcmp(list[i].serial, line->serial) == 0;
+	}
+	if (line->by_id[0])
+		snprintf(ret, 256, "%s", line->by_id);
+	else if (line->vendor && same == 1)
+		snprintf(ret, 256, "usb:%04x:%04x", line->vendor, line->product);
+	else if (line->vendor && twins == 1 && line->serial[0] && strspn(line->serial, digits) == strlen(line->serial))
+		snprintf(ret, 256, "usb:%04x:%04x:%s", line->vendor, line->product, line->serial);
+	else
+		snprintf(ret, 256, "%s", line->node);
+}
+
+static void describe_serial(const struct serial_line *list, int n, int i, int number, struct found *ret)
+{
+	const struct serial_line *line = &list[i];
+	char name[24], port[256], why[160];
 
 	*ret = (struct found){.kind = "serial",
 	                      .node = line->node,
@@ -188,8 +211,9 @@ static void describe_serial(const struct serial_line *line, int number, struct f
 	else
 		snprintf(ret->title, sizeof(ret->title), "%s, driver %s", line->node, line->driver);
 	name_device(number, name);
-	snprintf(ret->yaml, sizeof(ret->yaml), "- {name: %s, driver: lms2xx, port: '%s', baud: %d}", name,
-	         line->by_id[0] ? line->by_id : line->node, usual_baud(line));
+	name_port(list, n, line, port);
+	snprintf(ret->yaml, sizeof(ret->yaml), "- {name: %s, driver: lms2xx, port: '%s', baud: %d}", name, port,
+	         usual_baud(line));
 	ret->usable = true;
 	if (access(line->node, R_OK | W_OK) < 0) {
 		usb_list_explain(line->node, errno, "a udev rule has to give it to one, like dialout", why);
@@ -201,8 +225,8 @@ static void describe_serial(const struct serial_line *line, int number, struct f
 	if (line->latency_ms > 1)
 		note(ret, "the adapter holds bytes back for %d ms; facetd asks for 1 ms when it opens the line",
 		     line->latency_ms);
-	if (line->vendor && !line->by_id[0])
-		note(ret, "no name in /dev/serial/by-id (no udevd?): after the next plugging it may be another one");
+	if (line->vendor && strcmp(port, line->node) == 0)
+		note(ret, "it has no name of its own: after the next plugging its twin may be %s", line->node);
 }
 
 /* Saying */
@@ -288,7 +312,7 @@ int devices_main(int argc, char **argv)
 	for (int i = 0; i < usbs; i++, n++)
 		describe_usb(usb, usbs, i, n, &found[n]);
 	for (int i = 0; i < serials; i++, n++)
-		describe_serial(&serial[i], n, &found[n]);
+		describe_serial(serial, serials, i, n, &found[n]);
 	if (json)
 		return print_json(found, n) ? 1 : fflush(stdout) != 0;
 	print_text(found, n);

@@ -40,8 +40,8 @@ has() {
     counts "$@" >/dev/null
 }
 
-summary= more=
-wrong=
+summary='' more=''
+wrong=''
 play_once() { # as play; 1: see $wrong
     capture=$1 driver=$2 profiles=$3
     shift 3
@@ -69,7 +69,7 @@ YAML
     wrong="the daemon did not end well"
     kill -TERM $daemon
     wait $daemon || return 1
-    daemon=
+    daemon=''
 }
 
 play() { # CAPTURE DRIVER PROFILES [NAME VALUE]...; $more: keys of the device
@@ -88,7 +88,7 @@ play() { # CAPTURE DRIVER PROFILES [NAME VALUE]...; $more: keys of the device
     failed=1
 }
 
-more=
+more=''
 play cola_a/tim561_stream.bin tim 24 'duplicates' 0
 play cola_a/tim571_name_sRA.bin tim 1
 play cola_b/lms111_20210302.txt lms1xx 172 'duplicates' 3

@@ -91,7 +91,7 @@ struct decoder {
 	int model;              /* index into models, MODELS: not said */
 	uint32_t frequency_chz; /* last one believed; 0: none */
 	bool seen;              /* a scan was, since the link was opened; these tell it from the next */
-	uint16_t telegram_counter;
+	uint16_t telegram_counter, scan_counter;
 	uint32_t t_startup_us, t_transmit_us;
 	struct scan_count scans;
 	struct device_clock clock;
@@ -200,11 +200,12 @@ static void follow_count(struct decoder *d, uint16_t now)
 
 static bool is_duplicate(struct decoder *d, const struct cola_scan *s)
 {
-	const bool same = d->seen && s->telegram_counter == d->telegram_counter && s->scan_counter == d->scans.last &&
+	const bool same = d->seen && s->telegram_counter == d->telegram_counter && s->scan_counter == d->scan_counter &&
 	                  s->t_startup_us == d->t_startup_us && s->t_transmit_us == d->t_transmit_us;
 
 	d->seen = true;
 	d->telegram_counter = s->telegram_counter;
+	d->scan_counter = s->scan_counter;
 	d->t_startup_us = s->t_startup_us;
 	d->t_transmit_us = s->t_transmit_us;
 	return same;
@@ -451,6 +452,7 @@ static void name_fields(struct decoder *d, struct state *s)
 	state_u32(s, &d->frequency_chz);
 	state_bool(s, &d->seen);
 	state_u16(s, &d->telegram_counter);
+	state_u16(s, &d->scan_counter);
 	state_u32(s, &d->t_startup_us);
 	state_u32(s, &d->t_transmit_us);
 	state_bool(s, &d->scans.known);

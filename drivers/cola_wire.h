@@ -27,7 +27,8 @@ int cola_scan_frame(void *ctx, const uint8_t *buf, size_t len, bool boundary);
 /* What is inside a whole frame: the payload, from `s` on. */
 enum cola_dialect cola_payload(const uint8_t *frame, size_t len, const uint8_t **ret_payload, size_t *ret_len);
 
-/* The kinds of struct reply: the second letter of the command word decides. Its payload is the frame's. */
+/* The kinds of struct reply: the second letter of the command word decides. Its payload is the frame's, at most REPLY_MAX
+ * bytes of it (a scan; nobody waits for more of one than that it came). */
 enum cola_reply {
 	COLA_READ,    /* sRA: value */
 	COLA_WRITTEN, /* sWA */

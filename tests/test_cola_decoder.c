@@ -368,6 +368,10 @@ static void a_telegram_sent_twice_is_one_profile(void **state)
 	feed_scan(rig, &s, 1000, 0);
 	assert_int_equal(rig->profiles, 1);
 	assert_int_equal(count(rig, "duplicates"), 1);
+	feed_words(rig, "sEA LFErec"); /* an answer between the two changes nothing */
+	feed_scan(rig, &s, 1000, 0);
+	assert_int_equal(rig->profiles, 1);
+	assert_int_equal(count(rig, "duplicates"), 2);
 	s.t_transmit_us++; /* some models do not count, but stamp */
 	feed_scan(rig, &s, 1000, 0);
 	assert_int_equal(rig->profiles, 2);

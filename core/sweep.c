@@ -266,6 +266,7 @@ struct walk {
 	const struct sweep *s;
 	uint64_t tilt_next, pose_next;           /* first samples later than the time asked for last */
 	int64_t tilt_limit_ns;                   /* beyond the last tilt sample up to here */
+	int64_t tilt_gap_ns;                     /* between two samples at most, unless the servo stood */
 	double angle_rad, sine, cosine;          /* at the beam placed last */
 	double near_rad, near_sine, near_cosine; /* of an angle close by */
 	bool has_angle;
@@ -277,6 +278,7 @@ static void walk_init(struct walk *w, const struct sweep *s, int64_t t_ns)
 	*w = (struct walk){.s = s, .tilt_next = ring_after(&s->tilt, t_ns), .pose_next = ring_after(&s->pose, t_ns)};
 	int64_t period_ns = tilt_period_ns(s);
 	w->tilt_limit_ns = period_ns + period_ns / 2;
+	w->tilt_gap_ns = s->params.hold_ns + w->tilt_limit_ns;
 	w->map_base = s->params.map_base;
 }
 
@@ -304,6 +306,10 @@ static int walk_tilt(struct walk *w, int64_t t_ns, double *ret_rad)
 		before = tilt_at(s, w->tilt_next - 2);
 	} else {
 		after = tilt_at(s, w->tilt_next);
+		/* In so long a silence the servo may have turned round. */
+		if (after->t_ns - before->t_ns > w->tilt_gap_ns &&
+		    fabs(after->angle_rad - before->angle_rad) > STOOD_RAD)
+			return 1 + SWEEP_STALE_TILT;
 	}
 	double share = (double)(t_ns - before->t_ns) / (double)(after->t_ns - before->t_ns);
 	*ret_rad = before->angle_rad + (after->angle_rad - before->angle_rad) * share;

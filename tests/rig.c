@@ -34,9 +34,26 @@
 #define CONTIGUOUS_NS (20 * RIG_MS)
 #define DUMMY_FD      1000
 
-enum fault { UNPLUG, REFUSE, HANG, RESET, HALF_OPEN, BYTEWISE, HOLD, SLOW_WRITES, NO_BAUD, FAULTS };
-static const char *const fault_names[FAULTS] = {"unplug",   "refuse", "hang",        "reset",  "half open",
-                                                "bytewise", "hold",   "slow writes", "no baud"};
+enum fault {
+	UNPLUG,
+	REFUSE,
+	HANG,
+	RESET,
+	HALF_OPEN,
+	BYTEWISE,
+	HOLD,
+	SLOW_WRITES,
+	NO_BAUD,
+	FAULTS,
+	/* of the world around */
+	WALL_CLOCK = FAULTS,
+	LATE_ANGLES,
+	NO_ANGLES,
+	ALL_FAULTS
+};
+static const char *const fault_names[ALL_FAULTS] = {"unplug",    "refuse",     "hang",        "reset",
+                                                    "half open", "bytewise",   "hold",        "slow writes",
+                                                    "no baud",   "wall clock", "late angles", "no angles"};
 
 /* What a scanner measured: where each beam ended. */
 struct truth {
@@ -415,13 +432,13 @@ static int64_t draw_arrival(struct link *l)
 	int64_t delay_ns = l->rig->params.delay_ns ? l->rig->params.delay_ns : 300000;
 	int64_t arrival_ns = l->rig->now_ns + (int64_t)((0.1 + 0.9 * draw(&l->random)) * (double)delay_ns);
 
-	if (arrival_ns < l->last_arrival_ns)
-		arrival_ns = l->last_arrival_ns;
 	if (l->on[HOLD]) {
 		int64_t hold_ns = (int64_t)((l->value[HOLD] > 0 ? l->value[HOLD] : 100) * (double)RIG_MS);
 
 		arrival_ns += hold_ns - (arrival_ns - EPOCH_NS) % hold_ns;
 	}
+	if (arrival_ns < l->last_arrival_ns)
+		arrival_ns = l->last_arrival_ns;
 	return l->last_arrival_ns = arrival_ns;
 }
 
@@ -470,6 +487,11 @@ static void stir(struct link *l)
 
 /* The virtual link */
 
+static bool alive(const struct link *l)
+{
+	return !l->brain.alive || l->brain.alive(l->brain.ctx);
+}
+
 static void say_connected(struct link *l, bool yes)
 {
 	if (l->brain.connected)
@@ -497,7 +519,7 @@ static void begin_connecting(struct link *l)
 
 static void connect_now(struct link *l)
 {
-	if (l->on[UNPLUG] || l->on[HANG]) {
+	if (l->on[UNPLUG] || l->on[HANG] || !alive(l)) {
 		int64_t since_ns = l->rig->now_ns - l->connect_ns;
 
 		l->connect_at = l->connect_ns + (since_ns < SYN_AGAIN_NS ? 1 : 3) * SYN_AGAIN_NS + CONNECT_NS;
@@ -519,7 +541,7 @@ static struct link *link_open(const struct config_device *device, char error[160
 {
 	struct link *l = link_of(device);
 
-	if (l->transport != RIG_TCP && l->on[UNPLUG]) {
+	if (l->transport != RIG_TCP && (l->on[UNPLUG] || !alive(l))) {
 		snprintf(error, 160, "%.100s: there is no such device; plug it in, or correct `%s`",
 		         l->transport == RIG_SERIAL ? device->port : device->connect,
 		         l->transport == RIG_SERIAL ? "port" : "connect");
@@ -750,6 +772,17 @@ static int64_t next_event(const struct rig *r)
 	return next_ns > r->now_ns ? next_ns : r->now_ns;
 }
 
+/* Nobody hears of it where the power goes: a connection is half open then, a USB device gone. */
+static void see_power(struct link *l)
+{
+	if (l->state != OPEN || alive(l))
+		return;
+	if (l->transport == RIG_TCP)
+		l->dumb = true;
+	else
+		break_link(l, ENODEV);
+}
+
 static void serve(struct link *l)
 {
 	struct rig *r = l->rig;
@@ -761,6 +794,7 @@ static void serve(struct link *l)
 		connect_now(l);
 	if (l->brain.deadline(l->brain.ctx) <= r->now_ns)
 		stir(l);
+	see_power(l);
 	readable = l->readable && (l->state == DEAD || (l->pieces > 0 && piece_at(l, 0)->arrival_ns <= r->now_ns));
 	writable = l->writable && (l->state == DEAD || (l->state == OPEN && l->write_ns <= r->now_ns));
 	if (readable || writable)
@@ -840,14 +874,32 @@ static bool link_fault(struct link *l, enum fault kind, double value, bool on)
 	return true;
 }
 
+static bool world_fault(struct rig *r, enum fault kind, double value, bool on)
+{
+	switch (kind) {
+	case WALL_CLOCK:
+		r->ahead_ns = on ? (int64_t)(value * (double)RIG_SECOND) : 0;
+		pipeline_clock(r->pipeline, r->ahead_ns);
+		break;
+	case LATE_ANGLES:
+		r->tilt_late_ns = on ? (int64_t)(value * (double)RIG_MS) : 0;
+		break;
+	default:
+		r->tilt_late_ns = on ? INT64_MAX : 0;
+		break;
+	}
+	return true;
+}
+
 static bool order(struct rig *r, const char *device, const struct sim_fault *what, bool on)
 {
 	struct link *l = &r->link[rig_find(r, device)];
 	struct sim_fault fault = *what;
 
-	for (int i = 0; i < FAULTS; i++)
+	for (int i = 0; i < ALL_FAULTS; i++)
 		if (strcmp(fault.kind, fault_names[i]) == 0)
-			return link_fault(l, (enum fault)i, fault.value, on);
+			return i < FAULTS ? link_fault(l, (enum fault)i, fault.value, on)
+			                  : world_fault(r, (enum fault)i, fault.value, on);
 	snprintf(fault.device, sizeof(fault.device), "%s", device);
 	if (!l->brain.fault(l->brain.ctx, &fault, on, r->now_ns))
 		return false;
@@ -869,17 +921,6 @@ bool rig_once(struct rig *r, const char *device, const char *kind, double value)
 
 	snprintf(fault.kind, sizeof(fault.kind), "%s", kind);
 	return order(r, device, &fault, true);
-}
-
-void rig_clock(struct rig *r, int64_t ahead_ns)
-{
-	r->ahead_ns = ahead_ns;
-	pipeline_clock(r->pipeline, ahead_ns);
-}
-
-void rig_tilt_late(struct rig *r, int64_t late_ns)
-{
-	r->tilt_late_ns = late_ns;
 }
 
 /* To be seen from outside */

@@ -32,7 +32,12 @@ enum rig_transport { RIG_SERIAL, RIG_TCP, RIG_USB };
  *   "bytewise"     a read delivers a byte
  *   "hold"         bytes wait for so many ms (value, default 100) and are read as one
  *   "slow writes"  a write takes a byte, the next one 1 ms later
- *   "no baud"      SERIAL: the line refuses this rate (value) */
+ *   "no baud"      SERIAL: the line refuses this rate (value)
+ *
+ * and of the world around, whatever the device:
+ *   "wall clock"   it is now so many seconds ahead of log time, for those who send it
+ *   "late angles"  samples of the servo come so many ms late
+ *   "no angles"    they do not come at all */
 
 struct rig_params {
 	const char *yaml;  /* the devices; a modbus device is the servo, a pose device the localisation */
@@ -63,11 +68,6 @@ int64_t rig_now(const struct rig *);
 /* Orders a fault of the device or of its link, until it is taken back. False: nobody knows this kind. */
 bool rig_fault(struct rig *, const char *device, const char *kind, double value, bool on);
 bool rig_once(struct rig *, const char *device, const char *kind, double value); /* the next time it can befall */
-/* The wall clock is now so far ahead of log time. */
-void rig_clock(struct rig *, int64_t ahead_ns);
-/* Samples of the servo are late by so much, or (INT64_MAX) do not come. */
-void rig_tilt_late(struct rig *, int64_t late_ns);
-
 /* What is to be seen from outside. */
 struct rig_view {
 	enum supervisor_state state;

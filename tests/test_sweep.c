@@ -407,6 +407,38 @@ static void the_tilt_goes_on_for_one_and_a_half_periods(void **state)
 	sweep_destroy(s);
 }
 
+/* Who was silent for longer than a profile may wait may have turned round meanwhile; who stands where it stood has not. */
+static void angles_are_not_joined_over_a_long_silence(void **state)
+{
+	static const struct {
+		int64_t gap_ns;
+		double turned_rad;
+		bool joined;
+	} known[] = {{30 * MS, 0.1, true},
+	             {37 * MS, 0.1, true},
+	             {38 * MS, 0.1, false},
+	             {5000 * MS, 0.1, false},
+	             {5000 * MS, 0.0003, true}};
+	struct sweep_params params = plain_params();
+
+	(void)state;
+	assert_int_equal(params.hold_ns, 30 * MS);
+	for (size_t i = 0; i < sizeof known / sizeof known[0]; i++) {
+		struct sweep *s = sweep_create(&params);
+		int64_t t_ns = 10000 * MS, end_ns = t_ns + 180 * BEAM_NS;
+
+		for (int k = 20; k >= 0; k--)
+			add_tilt(s, end_ns + MS - known[i].gap_ns - 5 * k * MS, 0);
+		sweep_profile(s, make_profile(t_ns, 1, 5), end_ns);
+		add_tilt(s, end_ns + MS, known[i].turned_rad);
+		if (known[i].joined)
+			row_destroy(expect_row(s, end_ns + MS));
+		else
+			expect_drop(s, end_ns + MS, SWEEP_STALE_TILT);
+		sweep_destroy(s);
+	}
+}
+
 static void the_pose_goes_on_for_50_ms_with_its_last_twist(void **state)
 {
 	struct sweep_params params = plain_params();
@@ -823,6 +855,7 @@ int main(void)
 	    cmocka_unit_test(hold_is_judged_by_the_log_time_of_the_next_record),
 	    cmocka_unit_test(nothing_is_waited_for_at_the_end_of_an_input),
 	    cmocka_unit_test(the_tilt_goes_on_for_one_and_a_half_periods),
+	    cmocka_unit_test(angles_are_not_joined_over_a_long_silence),
 	    cmocka_unit_test(the_pose_goes_on_for_50_ms_with_its_last_twist),
 	    cmocka_unit_test(rows_without_samples_are_dropped_with_their_reason),
 	    cmocka_unit_test(the_oldest_profile_gives_way_when_too_many_wait),

@@ -1,5 +1,6 @@
 /* Law: no bytes on either wire crash the LMS2xx framer, decoder or dialogue, and what comes out does not depend on how the
- * bytes were cut into reads; what is decoded as a measurement encodes to the same values again.
+ * bytes were cut into reads; what is decoded as a measurement encodes to the same values again; a snapshot goes on the same,
+ * and a broken one is refused or bears what comes.
  *
  * Input: chunks, each a byte (6-7: what it is, 0-5: length / 16 - 1), then its bytes: raw from the device, the same 300 ms later,
  * raw to the device, or a payload from the device that gets its frame and check sum here (which nobody guesses). */
@@ -90,6 +91,34 @@ static void feed(struct reader *reader, enum direction direction, const uint8_t 
 	driver_lms2xx.decode(reader->decoder, &record, &sink);
 }
 
+/* The decoder is replaced by one that its snapshot was loaded into; another one gets the snapshot with a byte changed. */
+static void change_decoder(struct reader *reader, const struct config_device *config, const uint8_t *bytes, size_t len)
+{
+	static uint8_t snapshot[1 << 15];
+	struct reader broken = {.decoder = driver_lms2xx.decoder_create(config, 0), .t_ns = reader->t_ns};
+	struct decoder *fresh = driver_lms2xx.decoder_create(config, 0);
+	struct state s;
+	must(fresh != NULL && broken.decoder != NULL);
+	state_save(&s, snapshot, sizeof snapshot);
+	driver_lms2xx.state(reader->decoder, &s);
+	must(state_done(&s));
+	const size_t size = s.at;
+	state_load(&s, snapshot, size);
+	driver_lms2xx.state(fresh, &s);
+	must(state_done(&s));
+	driver_lms2xx.decoder_destroy(reader->decoder);
+	reader->decoder = fresh;
+	for (size_t i = 0; i + 2 < len; i += 3)
+		snapshot[(size_t)(bytes[i] << 8 | bytes[i + 1]) % size] ^= bytes[i + 2];
+	state_load(&s, snapshot, size);
+	driver_lms2xx.state(broken.decoder, &s);
+	for (int i = 0; i < 4; i++) {
+		feed(&broken, FROM_DEVICE, bytes, len);
+		broken.t_ns += 20000000;
+	}
+	driver_lms2xx.decoder_destroy(broken.decoder);
+}
+
 static void step(struct reader *reader)
 {
 	struct dialogue_step got;
@@ -128,6 +157,8 @@ int LLVMFuzzerTestOneInput(const uint8_t *data, size_t size)
 		for (size_t i = 0; i < len; i += piece)
 			feed(&bytewise, direction, bytes + i, piece);
 		step(&whole);
+		if (kind == LATE || (kind == FRAMED && len % 4 == 1))
+			change_decoder(&whole, &config.device[0], bytes, len < 6 ? len : 6);
 		must(whole.seen == bytewise.seen);
 	}
 	struct decoder_counters counters;

@@ -451,7 +451,7 @@ static void without_indices_the_period_does_nearly_as_well(void **state)
 }
 
 /* The mirror of a real TiM561 was seen to take 64.2 to 69.0 ms for a turn, from one to the next. */
-static void a_mirror_that_wanders_costs_what_its_next_turn_does(void **state)
+static void a_mirror_that_wanders_is_timed_turn_by_turn(void **state)
 {
 	const struct sim_fault wander = {.kind = "wander", .value = 2.4, .for_ns = INT64_MAX};
 	struct bench *b = open_kind(&kinds[0], 100, 0, false);
@@ -460,7 +460,7 @@ static void a_mirror_that_wanders_costs_what_its_next_turn_does(void **state)
 	assert_true(b->brain.fault(b->brain.ctx, &wander, true, b->now_ns));
 	run(b, 60);
 	printf("note: beam times of %s whose turns take 64.3 to 69.1 ms: p99 %.3f ms\n", kinds[0].name, p99_ms(b));
-	assert_true(p99_ms(b) < 3);
+	assert_true(p99_ms(b) < 1.2); /* turns from one to the next as they come here are worse than a mirror */
 	end(b);
 }
 
@@ -571,7 +571,7 @@ int main(void)
 	const struct CMUnitTest tests[] = {
 	    cmocka_unit_test(beams_have_their_times_after_five_seconds),
 	    cmocka_unit_test(without_indices_the_period_does_nearly_as_well),
-	    cmocka_unit_test(a_mirror_that_wanders_costs_what_its_next_turn_does),
+	    cmocka_unit_test(a_mirror_that_wanders_is_timed_turn_by_turn),
 	    cmocka_unit_test(a_latency_timer_of_16_ms_is_seen_through),
 	    cmocka_unit_test(swept_walls_are_as_thin_as_with_perfect_time),
 	    cmocka_unit_test(beams_that_are_5_ms_late_make_walls_thick),

@@ -158,7 +158,8 @@ static void check_profile(const struct rig *rig, const struct profile *p, const 
 	assert_int_equal(p->n, e->n);
 	assert_true(fabs(p->first_rad - (e->start_tdeg / 1e4 - 90) * TRIG_DEG) < 1e-9);
 	assert_true(fabs(p->step_rad - e->step_deg * TRIG_DEG) < 1e-9);
-	assert_true(fabs(p->beam_ns - 1e11 / e->frequency_chz * e->step_deg / 360) < 1);
+	assert_true(fabs(p->beam_ns / (1e11 / e->frequency_chz * e->step_deg / 360) - 1) <
+	            0.04); /* a TiM's mirror wanders */
 	for (unsigned i = 0; i < p->n; i++) {
 		assert_int_equal(p->state[i] == BEAM_OK, value[i] >= least);
 		if (p->state[i] == BEAM_OK)

@@ -16,7 +16,8 @@
  * The time of an exchange begins when its bytes are with the kernel, which is when the step after the write comes: while
  * a connection is being made nothing is outstanding.
  *
- * While streaming, silence for five scans is a lost link: a pulled cable tells nobody. */
+ * While streaming, silence for five scans is a lost link: a pulled cable tells nobody. A line that only has hiccups (lost
+ * packets that TCP repeats after 200 ms and more) is given more time after the first of them. */
 #include "drivers/cola.h"
 
 #include <stdio.h>
@@ -41,6 +42,8 @@
 #define FIRST_NS   (3000 * MS)  /* to the first telegram: a mirror may have to spin up */
 #define SILENT_NS  (250 * MS)   /* at least, five scans at most so long ... */
 #define SILENT_MAX (2000 * MS)  /* ... and at most, but two scans at least */
+#define FLOOR_MAX  (1000 * MS)  /* SILENT_NS is doubled up to here while a line has hiccups ... */
+#define STEADY_NS  (20000 * MS) /* ... and halved after so long without one */
 #define GRACE_NS   (20 * MS)    /* the host itself may have slept: what waits in its buffers is read first */
 #define HOLD_NS    (1000 * MS)  /* doubled with every time ... */
 #define HOLD_MAX   (30000 * MS) /* ... up to here */
@@ -144,9 +147,10 @@ struct dialogue {
 	int64_t ready_ns; /* end of patience with READY */
 
 	/* what is kept over openings */
-	bool stood_still; /* it acknowledged the stream and sent nothing: it is started the next time */
-	char told[160];   /* the last failure that would repeat itself, empty since it streamed ... */
-	int64_t hold_ns;  /* ... and how long it is held when it comes again */
+	bool stood_still;            /* it acknowledged the stream and sent nothing: it is started the next time */
+	char told[160];              /* the last failure that would repeat itself, empty since it streamed ... */
+	int64_t hold_ns;             /* ... and how long it is held when it comes again */
+	int64_t floor_ns, steady_ns; /* silence that is no loss, and since when it is enough */
 
 	int64_t heard_ns; /* last telegram with a scan, or the link's opening; */
 	bool heard;       /* ... which of the two */
@@ -603,7 +607,7 @@ static int64_t silence_ns(const struct dialogue *d)
 {
 	const int64_t period = period_ns(d), most = 2 * period > SILENT_MAX ? 2 * period : SILENT_MAX;
 	const int64_t five = period ? SCANS_LOST * period : SILENT_MAX;
-	return five < SILENT_NS ? SILENT_NS : five > most ? most : five;
+	return five < d->floor_ns ? d->floor_ns : five > most ? most : five;
 }
 
 static void judge_silence(struct dialogue *d, int64_t t_ns)
@@ -615,6 +619,7 @@ static void judge_silence(struct dialogue *d, int64_t t_ns)
 		d->late_ns = t_ns + GRACE_NS;
 	if (t_ns < d->late_ns)
 		return;
+	d->floor_ns = 2 * d->floor_ns < FLOOR_MAX ? 2 * d->floor_ns : FLOOR_MAX;
 	snprintf(sentence, sizeof sentence,
 	         "no scan for %d ms, %d were due: the connection is dead or the scanner stands still",
 	         (int)((t_ns - d->heard_ns) / MS),
@@ -729,15 +734,29 @@ void cola_dialogue_reply(struct dialogue *d, const struct reply *reply)
 	}
 }
 
+/* Time that was given for hiccups is taken back when none needed it any more. */
+static void follow_hiccups(struct dialogue *d, int64_t t_ns)
+{
+	if (t_ns - d->heard_ns > d->floor_ns / 2)
+		d->steady_ns = t_ns;
+	if (t_ns - d->steady_ns < STEADY_NS)
+		return;
+	d->floor_ns = d->floor_ns / 2 > SILENT_NS ? d->floor_ns / 2 : SILENT_NS;
+	d->steady_ns = t_ns;
+}
+
 void cola_dialogue_data(struct dialogue *d, int64_t t_ns)
 {
 	if (d->stage == STAGE_STREAMING && t_ns > d->heard_ns) /* several came at once: one, as far as time goes */
 		d->interval_ns[d->intervals++ % PERIODS] = t_ns - d->heard_ns;
+	if (d->stage == STAGE_STREAMING)
+		follow_hiccups(d, t_ns);
 	d->heard = true;
 	d->heard_ns = t_ns;
 	d->late_ns = 0;
 	if (d->stage == STAGE_FIRST) {
 		d->stage = STAGE_STREAMING;
+		d->steady_ns = t_ns;
 		d->intervals = 0;
 		d->told[0] = '\0';
 		d->stood_still = false;
@@ -805,6 +824,7 @@ struct dialogue *cola_dialogue_create(const struct config *config, int device)
 		return NULL;
 	d->config = &config->device[device];
 	d->family = cola_family(d->config->driver);
+	d->floor_ns = SILENT_NS;
 	cola_dialogue_reset(d, 0);
 	return d;
 }

@@ -1088,6 +1088,34 @@ static void a_slow_stream_is_no_dead_one(void **state)
 	}
 }
 
+static void a_line_with_hiccups_is_given_more_time(void **state)
+{
+	(void)state;
+	struct world *w = create(LMS1XX);
+	int losses = 0;
+	run(w, 2 * SECONDS);
+	for (int i = 0; i < 10; i++) {
+		assert_streams(w);
+		w->scanner.deaf = true;
+		run(w, 300 * MS);
+		w->scanner.deaf = false;
+		if (w->ended) {
+			losses++;
+			reopen(w);
+		}
+		run(w, 5 * SECONDS);
+	}
+	assert_streams(w);
+	assert_true(losses >= 1 && losses <= 2);
+	run(w, 60 * SECONDS); /* without any: found as soon as at first */
+	const int64_t begin_ns = w->now_ns;
+	w->scanner.deaf = true;
+	run(w, 5 * SECONDS);
+	assert_failed(w, "no scan for");
+	assert_true(w->now_ns - begin_ns <= 275 * MS);
+	destroy(w);
+}
+
 /* The loop slept for half a second: what waits in the socket is read after the timer's turn. */
 static void a_host_that_slept_loses_no_connection(void **state)
 {
@@ -1323,6 +1351,7 @@ int main(void)
 	    cmocka_unit_test(a_refusal_is_not_repeated_fast_and_not_kept_for_long),
 	    cmocka_unit_test(half_open_connections_are_found_within_five_scans),
 	    cmocka_unit_test(a_slow_stream_is_no_dead_one),
+	    cmocka_unit_test(a_line_with_hiccups_is_given_more_time),
 	    cmocka_unit_test(a_host_that_slept_loses_no_connection),
 	    cmocka_unit_test(silence_after_the_stream_was_switched_on_is_said),
 	    cmocka_unit_test(a_stream_that_is_not_switched_on_is_said),

@@ -167,6 +167,22 @@ static int check_cola(struct reader *r, const struct config_device *device, int 
 	return 0;
 }
 
+/* A port that is no path names an adapter: usb:VENDOR:PRODUCT[:SERIAL], as drivers/serial_find.c looks for it. */
+static int check_lms2xx(struct reader *r, const struct config_device *device, int i)
+{
+	static const char hex[] = "0123456789abcdefABCDEF";
+	const char *text = device->port;
+	char shown[READER_SHOWN_MAX];
+	if (strncmp(text, "usb:", 4) != 0)
+		return 0;
+	const bool good = strspn(text + 4, hex) == 4 && text[8] == ':' && strspn(text + 9, hex) == 4 &&
+	                  (!text[13] || (text[13] == ':' && text[14]));
+	return good ? 0
+	            : reader_fail(r, device_line(r, i, "port"),
+	                          "devices[%d].port: '%s' is not usb:VENDOR:PRODUCT[:SERIAL], like usb:0403:6001", i,
+	                          reader_shown(text, shown));
+}
+
 static int check_modbus(struct reader *r, const struct config_device *device, int i)
 {
 	const struct {
@@ -222,6 +238,8 @@ static int check_device(struct reader *r, const struct config *config, int i)
 		error = check_tilt_name(r, config, key, device->tilt, device_line(r, i, "tilt"));
 	if (!error && keys_driver(device->driver) == KEY_MODBUS)
 		error = check_modbus(r, device, i);
+	if (!error && keys_driver(device->driver) == KEY_LMS2XX)
+		error = check_lms2xx(r, device, i);
 	if (!error && is_cola(device))
 		error = check_cola(r, device, i);
 	if (!error && keys_driver(device->driver) == KEY_POSE)

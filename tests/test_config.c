@@ -449,7 +449,7 @@ static const char scanners[] =
     "  - {name: left, driver: lms1xx, connect: 192.168.0.1, frequency: 25Hz, resolution: 0.25deg, remission: 16,\n"
     "     angles: [-45deg, 90deg], encoder: {scale: 0.02deg, zero: 5, sign: -1, wrap: 16384}, tilt: left}\n"
     "  - {name: right, driver: lms5xx, connect: \"192.168.0.1:2111\", protocol: b, remission: 8, stamp: start}\n"
-    "  - {name: old, driver: lms2xx, port: /dev/l, indices: on, latency: 1ms}\n";
+    "  - {name: old, driver: lms2xx, port: usb:0403:6001:A10X, indices: on, latency: 1ms}\n";
 
 static void every_value_of_a_scanner_arrives(void **state)
 {
@@ -617,6 +617,12 @@ static void values_of_a_scanner_out_of_range_are_refused(void **state)
 		snprintf(text, sizeof(text), "devices:\n- {name: s, driver: lms1xx, connect: 10.0.0.1, %s}",
 		         bad[i].more);
 		assert_refused(text, "f.yaml:2: devices[0]", bad[i].sentence);
+	}
+	static const char *const ports[] = {"usb:",          "usb:0403",       "usb:403:6001",
+	                                    "usb:0403:60g1", "usb:0403:6001:", "usb:04036001"};
+	for (size_t i = 0; i < sizeof(ports) / sizeof(ports[0]); i++) {
+		snprintf(text, sizeof(text), "devices: [{name: l, driver: lms2xx, port: '%s'}]", ports[i]);
+		assert_refused(text, "f.yaml:1:", "is not usb:VENDOR:PRODUCT[:SERIAL]");
 	}
 	assert_refused("devices: [{name: l, driver: lms2xx, port: /l, indices: off}]", "f.yaml:1:", "one of keep, on");
 	assert_refused("devices: [{name: l, driver: lms2xx, port: /l, latency: -1.5s}]", "f.yaml:1:", "-1s .. 1s");

@@ -8,6 +8,7 @@
 #include <errno.h>
 #include <fcntl.h>
 #include <grp.h>
+#include <limits.h>
 #include <stdbool.h>
 #include <stdio.h>
 #include <stdlib.h>
@@ -17,18 +18,17 @@
 
 #define DEVICES "/sys/bus/usb/devices"
 
-/* A line of a file of the device, printable: a device's strings are not to be trusted. Empty where there is none. */
-static void read_value(const char *port, const char *name, char *ret, size_t cap)
+bool usb_list_value(const char *folder, const char *name, char *ret, size_t cap)
 {
-	char path[128];
+	char path[PATH_MAX];
 	ssize_t n;
-	int fd;
+	int fd = -1;
 
 	ret[0] = 0;
-	snprintf(path, sizeof(path), DEVICES "/%.60s/%s", port, name);
-	fd = open(path, O_RDONLY | O_CLOEXEC);
+	if (snprintf(path, sizeof(path), "%s/%s", folder, name) < (int)sizeof(path))
+		fd = open(path, O_RDONLY | O_CLOEXEC);
 	if (fd < 0)
-		return;
+		return false;
 	n = read(fd, ret, cap - 1);
 	close(fd);
 	ret[n > 0 ? n : 0] = 0;
@@ -36,13 +36,14 @@ static void read_value(const char *port, const char *name, char *ret, size_t cap
 	for (char *c = ret; *c; c++)
 		if (*c < ' ' || *c > '~' || *c == '"' || *c == '\\')
 			*c = '?';
+	return true;
 }
 
-static unsigned long read_number(const char *port, const char *name, int base)
+static unsigned long read_number(const char *folder, const char *name, int base)
 {
 	char text[16];
 
-	read_value(port, name, text, sizeof(text));
+	usb_list_value(folder, name, text, sizeof(text));
 	return strtoul(text, NULL, base);
 }
 
@@ -67,14 +68,17 @@ static int compare(const void *a, const void *b)
 
 static bool describe(const char *port, uint16_t vendor, uint16_t product, struct usb_device *ret)
 {
-	if (read_number(port, "idVendor", 16) != vendor || read_number(port, "idProduct", 16) != product)
+	char folder[sizeof(DEVICES) + sizeof(ret->port)];
+
+	snprintf(folder, sizeof(folder), DEVICES "/%s", port);
+	if (read_number(folder, "idVendor", 16) != vendor || read_number(folder, "idProduct", 16) != product)
 		return false;
 	memset(ret, 0, sizeof(*ret));
 	snprintf(ret->port, sizeof(ret->port), "%s", port);
-	ret->bus = (unsigned)read_number(port, "busnum", 10) % 1000;
-	ret->address = (unsigned)read_number(port, "devnum", 10) % 1000;
-	read_value(port, "serial", ret->serial, sizeof(ret->serial));
-	read_value(port, "product", ret->product, sizeof(ret->product));
+	ret->bus = (unsigned)read_number(folder, "busnum", 10) % 1000;
+	ret->address = (unsigned)read_number(folder, "devnum", 10) % 1000;
+	usb_list_value(folder, "serial", ret->serial, sizeof(ret->serial));
+	usb_list_value(folder, "product", ret->product, sizeof(ret->product));
 	snprintf(ret->node, sizeof(ret->node), "/dev/bus/usb/%03u/%03u", ret->bus, ret->address);
 	return true;
 }

@@ -3,6 +3,7 @@
 #ifndef FACET_DRIVERS_USB_LIST_H
 #define FACET_DRIVERS_USB_LIST_H
 
+#include <stdbool.h>
 #include <stddef.h>
 #include <stdint.h>
 
@@ -24,6 +25,10 @@ int usb_list_choose(const struct usb_device *list, int n, const char *connect, c
 
 /* What to write after `usb:` for list[i]: the serial number where it is unique and reads as one, else the port. */
 const char *usb_list_name(const struct usb_device *list, int n, int i);
+
+/* The first line of the file `name` of a folder of sysfs, made printable: what a device says of itself is not to be
+ * trusted. False, and empty: there is none. */
+bool usb_list_value(const char *folder, const char *name, char *ret, size_t cap);
 
 /* Tries to open the device's node: 0, or -errno with why it cannot and what to do. */
 int usb_list_permitted(const struct usb_device *, char why[160]);

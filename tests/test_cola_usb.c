@@ -583,7 +583,8 @@ int main(int argc, char **argv)
 	(void)argc;
 	const char *preloaded = getenv("LD_PRELOAD");
 	if (!preloaded || !strstr(preloaded, "umockdev")) {
-		execvp("umockdev-wrapper", (char *[]){"umockdev-wrapper", argv[0], NULL});
+		static char wrapper[] = "umockdev-wrapper";
+		execvp(wrapper, (char *[]){wrapper, argv[0], NULL});
 		printf("umockdev-wrapper is not here: install the package umockdev (make deps)\n");
 		return 77;
 	}

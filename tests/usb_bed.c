@@ -245,7 +245,8 @@ static int run(char **command, UMockdevTestbed *bed, struct orders *orders)
 
 static void run_again_wrapped(int argc, char **argv)
 {
-	char *again[64] = {"umockdev-wrapper"};
+	static char wrapper[] = "umockdev-wrapper";
+	char *again[64] = {wrapper};
 
 	for (int i = 0; i < argc && i < 62; i++)
 		again[i + 1] = argv[i];

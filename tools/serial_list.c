@@ -6,7 +6,6 @@
 #include "tools/serial_list.h"
 
 #include <dirent.h>
-#include <fcntl.h>
 #include <limits.h>
 #include <stdbool.h>
 #include <stdio.h>
@@ -14,30 +13,10 @@
 #include <string.h>
 #include <unistd.h>
 
+#include "drivers/usb_list.h"
+
 #define TTYS  "/sys/class/tty"
 #define BY_ID "/dev/serial/by-id"
-
-/* A line of a file, printable: what a device says is not to be trusted. False: there is none. */
-static bool read_value(const char *dir, const char *name, char *ret, size_t cap)
-{
-	char path[PATH_MAX];
-	ssize_t n = -1;
-
-	ret[0] = 0;
-	if (snprintf(path, sizeof(path), "%s/%s", dir, name) >= (int)sizeof(path))
-		return false;
-	int fd = open(path, O_RDONLY | O_CLOEXEC);
-	if (fd < 0)
-		return false;
-	n = read(fd, ret, cap - 1);
-	close(fd);
-	ret[n > 0 ? n : 0] = 0;
-	ret[strcspn(ret, "\n")] = 0;
-	for (char *c = ret; *c; c++)
-		if (*c < ' ' || *c > '~' || *c == '"' || *c == '\\')
-			*c = '?';
-	return true;
-}
 
 static const char *last_part(const char *path)
 {
@@ -76,11 +55,11 @@ static void read_usb(char *dir, struct serial_line *line)
 	char vendor[8], product[8], maker[24], title[40];
 
 	while (strlen(dir) > strlen("/sys/devices")) {
-		if (read_value(dir, "idVendor", vendor, sizeof(vendor))) {
-			read_value(dir, "idProduct", product, sizeof(product));
-			read_value(dir, "manufacturer", maker, sizeof(maker));
-			read_value(dir, "product", title, sizeof(title));
-			read_value(dir, "serial", line->serial, sizeof(line->serial));
+		if (usb_list_value(dir, "idVendor", vendor, sizeof(vendor))) {
+			usb_list_value(dir, "idProduct", product, sizeof(product));
+			usb_list_value(dir, "manufacturer", maker, sizeof(maker));
+			usb_list_value(dir, "product", title, sizeof(title));
+			usb_list_value(dir, "serial", line->serial, sizeof(line->serial));
 			line->vendor = (uint16_t)strtoul(vendor, NULL, 16);
 			line->product = (uint16_t)strtoul(product, NULL, 16);
 			snprintf(line->name, sizeof(line->name), "%s%s%s", maker, maker[0] && title[0] ? " " : "",
@@ -102,11 +81,11 @@ static bool describe(const char *tty, struct serial_line *ret)
 	if (!realpath(dir, device) || strncmp(device, "/sys/", 5) != 0)
 		return false;
 	snprintf(dir, sizeof(dir), TTYS "/%s", tty);
-	if (read_value(dir, "type", text, sizeof(text)) && strcmp(text, "0") == 0)
+	if (usb_list_value(dir, "type", text, sizeof(text)) && strcmp(text, "0") == 0)
 		return false;
 	snprintf(ret->node, sizeof(ret->node), "/dev/%.50s", tty);
 	read_driver(device, ret->driver, sizeof(ret->driver));
-	ret->latency_ms = read_value(device, "latency_timer", text, sizeof(text)) ? atoi(text) : -1;
+	ret->latency_ms = usb_list_value(device, "latency_timer", text, sizeof(text)) ? atoi(text) : -1;
 	read_usb(device, ret);
 	return true;
 }

@@ -241,9 +241,12 @@ static ssize_t usb_read(struct link *link, uint8_t *buf, size_t cap, int64_t *t_
 	struct usb *usb = (struct usb *)link;
 	struct timeval no_time = {0};
 	size_t n;
+	int r;
 
 	(void)t_ns; /* libusb does not say when a transfer ended */
-	libusb_handle_events_timeout_completed(usb->context, &no_time, NULL);
+	r = libusb_handle_events_timeout_completed(usb->context, &no_time, NULL);
+	if (r < 0 && r != LIBUSB_ERROR_INTERRUPTED)
+		lose(usb, -ENODEV); /* else its descriptors would call again and again */
 	n = take(usb, buf, cap);
 	recover(usb);
 	if (!usb->halted)

@@ -39,7 +39,7 @@ refused 2 'one word too many' hall kitchen
 refused 2 'no colon behind the device' hall --fault noise
 refused 2 'wants a time' hall --fault 'laser: garbage for'
 refused 1 "'smoke': laser has no such fault; it has .*crc.*unplug" hall --fault 'laser: smoke'
-refused 1 "'radar': no such device; there is laser, pose" hall --fault 'radar: garbage'
+refused 1 "'radar': no such device; there is laser, servo, pose" hall --fault 'radar: garbage'
 refused 2 'none of lms2xx, tim, lms1xx, lms5xx' hall --laser radar
 refused 2 'only lms1xx and lms5xx' hall --laser tim --encoder
 refused 2 '--laser is for worlds' uos:/nowhere --laser tim

@@ -41,7 +41,6 @@ static void sentences_say_what_when_and_how_long(void **state)
 	check("laser: sfa 3 at 500ms", "sfa", 3, S / 2, 0);
 	check("laser: clock step -0.5", "clock step", -0.5, 0, 0);
 	check("laser: lost 0.1 for ever", "lost", 0.1, 0, INT64_MAX);
-	check("  laser: nak" + 2, "nak", 0, 0, 0);
 }
 
 static void what_needs_a_duration_has_one(void **state)

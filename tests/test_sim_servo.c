@@ -16,7 +16,7 @@
 #include <unistd.h>
 
 #include "core/trig.h"
-#include "tools/simulator.h"
+#include "tools/sim_device.h"
 
 #define DEG    TRIG_DEG
 #define SECOND INT64_C(1000000000)
@@ -255,6 +255,44 @@ static void an_independent_master_reads_it(void **state)
 	sim_servo_destroy(servo);
 }
 
+static void order(struct sim_servo *servo, const char *kind, double value, int64_t for_ns, bool on)
+{
+	struct sim_fault fault = {.value = value, .for_ns = for_ns};
+
+	snprintf(fault.kind, sizeof fault.kind, "%s", kind);
+	assert_true(sim_servo_fault(servo, &fault, on));
+}
+
+static void it_is_silent_busy_and_late_when_that_was_ordered(void **state)
+{
+	struct sim_servo_params params = {.rtu = rtu, .slave = 3, .angle_rad = 0.0};
+	struct sim_servo *servo = create(&params);
+	modbus_t *modbus = client(rtu);
+	uint16_t r[2];
+	int64_t begin_ns;
+
+	(void)state;
+	assert_int_equal(position_of(modbus), 0);
+	order(servo, "busy", 0, 0, true);
+	assert_int_equal(modbus_read_registers(modbus, 0, 2, r), -1);
+	assert_int_equal(errno, EMBXSBUSY);
+	assert_int_equal(position_of(modbus), 0);
+	begin_ns = now_ns();
+	order(servo, "late", 150, 0, true);
+	assert_int_equal(position_of(modbus), 0);
+	assert_true(now_ns() - begin_ns >= 150000000);
+	order(servo, "silence", 0, SECOND, true);
+	modbus_set_response_timeout(modbus, 0, 200000);
+	assert_int_equal(modbus_read_registers(modbus, 0, 2, r), -1);
+	assert_int_equal(errno, ETIMEDOUT);
+	order(servo, "silence", 0, SECOND, false);
+	modbus_set_response_timeout(modbus, 10, 0);
+	assert_int_equal(position_of(modbus), 0);
+	modbus_close(modbus);
+	modbus_free(modbus);
+	sim_servo_destroy(servo);
+}
+
 int main(void)
 {
 	const struct CMUnitTest tests[] = {
@@ -265,6 +303,7 @@ int main(void)
 	    cmocka_unit_test(several_clients_are_served_over_tcp),
 	    cmocka_unit_test(a_place_that_cannot_be_had_is_said),
 	    cmocka_unit_test(an_independent_master_reads_it),
+	    cmocka_unit_test(it_is_silent_busy_and_late_when_that_was_ordered),
 	};
 
 	return cmocka_run_group_tests(tests, make_dir, remove_dir);

@@ -47,7 +47,7 @@ struct scenario {
 	struct sim_pty *laser_pty;
 	struct sim_tcp *laser_tcp;
 	struct sim_control *control;
-	struct fault_target target[2];
+	struct fault_target target[3];
 	bool mute; /* a fault: poses are not sent */
 	uv_timer_t *timer;
 	int pose_fd;
@@ -256,6 +256,8 @@ static bool order(void *ctx, const struct sim_fault *fault, bool on)
 
 	if (!strcmp(fault->device, "pose"))
 		s->mute = on;
+	else if (!strcmp(fault->device, "servo"))
+		return sim_servo_fault(s->servo, fault, on);
 	else if (s->laser_pty)
 		return sim_pty_fault(s->laser_pty, fault, on);
 	else
@@ -281,12 +283,13 @@ static int start_control(struct scenario *s, uv_loop_t *loop, char error[SCENARI
 {
 	char path[128], why[FAULT_ERROR_MAX];
 	struct sim_control_params params = {
-	    .socket = path, .target = s->target, .targets = 2, .ctx = s, .order = order, .status = print_status};
+	    .socket = path, .target = s->target, .targets = 3, .ctx = s, .order = order, .status = print_status};
 	int r = 0;
 
 	s->target[0] = (struct fault_target){
 	    "laser", {s->laser.fault_kinds, s->laser_pty ? sim_pty_fault_kinds() : sim_tcp_fault_kinds()}};
-	s->target[1] = (struct fault_target){"pose", {pose_kinds, NULL}};
+	s->target[1] = (struct fault_target){"servo", {sim_servo_fault_kinds(), NULL}};
+	s->target[2] = (struct fault_target){"pose", {pose_kinds, NULL}};
 	snprintf(path, sizeof path, "%.110s/simulator.sock", s->params.dir);
 	s->control = sim_control_create(loop, &params, why);
 	for (int i = 0; s->control && !r && i < s->params.faults; i++)

@@ -15,7 +15,7 @@
  * both as short as such pauses usually are (the median of the last ones, and a millisecond).
  *
  * Times are CLOCK_MONOTONIC in ns, as uv_hrtime says them. */
-#include "tools/simulator.h"
+#include "tools/sim_device.h"
 
 #include <errno.h>
 #include <fcntl.h>
@@ -49,6 +49,9 @@ struct leg { /* from t_ns on; counts of 0.001 degree */
 	double from, to, speed;
 };
 
+static const char *const kinds[] = {"silence", "lost", "busy", "late", NULL};
+enum fault { SILENCE, LOST, BUSY, LATE, FAULTS };
+
 struct sim_servo {
 	int slave;
 	char link[108]; /* empty: TCP */
@@ -68,7 +71,9 @@ struct sim_servo {
 	uint32_t pauses;
 	int64_t answered_ns; /* the last answer, of whatever */
 	bool prompt;         /* the request before it came in good time */
-	bool pending;        /* it carried the angle, and is to be counted when the next request comes */
+	struct sim_fault_state fault[FAULTS];
+	uint64_t random;
+	bool pending; /* it carried the angle, and is to be counted when the next request comes */
 };
 
 static int64_t now_ns(void)
@@ -191,6 +196,29 @@ static void judge_last_answer(struct sim_servo *s, int64_t t_ns)
 	s->pending = false;
 }
 
+/* The registers are filled. False: this request is not answered, or by an exception. Late, the answer carries the angle of
+ * before. The lock is let go of meanwhile; who ends the thread ends the wait. */
+static bool befalls(struct sim_servo *s, const uint8_t *request)
+{
+	struct pollfd stop = {.fd = s->stop[0], .events = POLLIN};
+
+	if (s->fault[SILENCE].on || (s->fault[LOST].on && sim_random(&s->random) < s->fault[LOST].value) ||
+	    (!s->fault[LOST].on && sim_fault_due(&s->fault[LOST])))
+		return false;
+	if (sim_fault_due(&s->fault[BUSY])) {
+		modbus_reply_exception(s->modbus, request, MODBUS_EXCEPTION_SLAVE_OR_SERVER_BUSY);
+		return false;
+	}
+	if (sim_fault_due(&s->fault[LATE])) {
+		int ms = (int)sim_fault_value(&s->fault[LATE], 20.0);
+
+		pthread_mutex_unlock(&s->lock);
+		poll(&stop, 1, ms);
+		pthread_mutex_lock(&s->lock);
+	}
+	return true;
+}
+
 /* One request of the current line. False: the line is lost. An answer counts with the angle it carries. */
 static bool serve(struct sim_servo *s)
 {
@@ -209,6 +237,10 @@ static bool serve(struct sim_servo *s)
 	t_ns = now_ns(); /* what a write asks for begins before its answer is seen */
 	judge_last_answer(s, t_ns);
 	fill_registers(s, t_ns);
+	if (!befalls(s, request)) {
+		pthread_mutex_unlock(&s->lock);
+		return true;
+	}
 	n = modbus_reply(s->modbus, request, n, s->map);
 	take_registers(s, t_ns);
 	s->pending = n >= 0 && reads_position(request + header);
@@ -419,4 +451,23 @@ uint64_t sim_servo_answers(struct sim_servo *s)
 	answers = s->answers;
 	pthread_mutex_unlock(&s->lock);
 	return answers;
+}
+
+const char *const *sim_servo_fault_kinds(void)
+{
+	return kinds;
+}
+
+bool sim_servo_fault(struct sim_servo *s, const struct sim_fault *fault, bool on)
+{
+	int i = sim_fault_index(kinds, fault->kind);
+
+	if (i < 0)
+		return false;
+	pthread_mutex_lock(&s->lock);
+	sim_fault_set(&s->fault[i], fault, on);
+	if (i == LOST && s->fault[i].value == 0.0)
+		s->fault[i].value = 1.0;
+	pthread_mutex_unlock(&s->lock);
+	return true;
 }

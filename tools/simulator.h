@@ -96,6 +96,9 @@ double sim_servo_angle(
 void sim_servo_place(struct sim_servo *, double angle_rad); /* stands there from now on (playback steps) */
 uint64_t sim_servo_answers(
     struct sim_servo *); /* position reads so far whose answer was taken in good time, as the next request shows */
+/* Its faults: "silence", "lost" (share of its answers), "busy" (exception 6), "late" (ms; the angle is that of before). */
+bool sim_servo_fault(struct sim_servo *, const struct sim_fault *, bool on);
+const char *const *sim_servo_fault_kinds(void);
 
 /* Built-in worlds of flat and round things; distances in metres, map frame (z up, floor at 0). */
 struct world;

@@ -127,7 +127,7 @@ static void add_scanner(UMockdevTestbed *bed, const char *text)
 	plug(s, bed);
 }
 
-static bool is_read(struct usbfs *usb, bool *ret_full)
+static bool is_claimed(struct usbfs *usb, bool *ret_full)
 {
 	int waiting = 0;
 
@@ -135,25 +135,25 @@ static bool is_read(struct usbfs *usb, bool *ret_full)
 	for (struct usbfs_piece *piece = usb->first; piece; piece = piece->next)
 		waiting++;
 	*ret_full = waiting >= PIECES_MAX;
-	bool read = usb->ins > 0 && !usb->gone;
+	bool claimed = usb->claimed && !usb->gone;
 	pthread_mutex_unlock(&usb->lock);
-	return read;
+	return claimed;
 }
 
 /* What is due by now: time for the brain, its bytes to the port. */
 static void serve(struct scanner *s)
 {
 	static uint8_t bytes[65536];
-	bool full = false, read = is_read(&s->usb, &full);
+	bool full = false, claimed = is_claimed(&s->usb, &full);
 	size_t n;
 
 	pthread_mutex_lock(&s->lock);
-	if (read != s->connected)
-		s->brain.connected(s->brain.ctx, read, now_ns());
-	s->connected = read;
+	if (claimed != s->connected)
+		s->brain.connected(s->brain.ctx, claimed, now_ns());
+	s->connected = claimed;
 	s->brain.advance(s->brain.ctx, now_ns());
 	while ((n = s->brain.transmit(s->brain.ctx, bytes, sizeof(bytes))) > 0)
-		if (read && !full)
+		if (claimed && !full)
 			usbfs_send(&s->usb, bytes, n, true);
 	pthread_mutex_unlock(&s->lock);
 }

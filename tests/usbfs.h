@@ -53,9 +53,9 @@ struct usbfs {
 	struct usbfs_urb in[USBFS_URBS], done[USBFS_URBS], out; /* out: held when `deaf` */
 	int ins, dones;
 	struct usbfs_piece *first, *last;
-	bool gone, halted, deaf, busy, hangs; /* hangs: keeps what it is asked to give back */
-	int halt_on_clear;                    /* it halts again so often when it is cleared */
-	char kernel_driver[32];               /* bound to the interface; detached by who claims it */
+	bool claimed, gone, halted, deaf, busy, hangs; /* hangs: keeps what it is asked to give back */
+	int halt_on_clear;                             /* it halts again so often when it is cleared */
+	char kernel_driver[32];                        /* bound to the interface; detached by who claims it */
 	struct usbfs_counts count;
 	void *ctx;
 	void (*written)(void *ctx, const uint8_t *bytes, size_t len); /* in umockdev's thread */
@@ -224,6 +224,7 @@ static inline int usbfs_claim(struct usbfs *u, bool detach)
 		u->count.detached++;
 	u->kernel_driver[0] = 0;
 	u->count.claims++;
+	u->claimed = true;
 	return 0;
 }
 
@@ -258,6 +259,7 @@ static inline gboolean usbfs_ioctl(UMockdevIoctlBase *base, UMockdevIoctlClient 
 		r = usbfs_claim(u, request == USBDEVFS_DISCONNECT_CLAIM);
 	} else if (request == USBDEVFS_RELEASEINTERFACE) {
 		u->count.released++;
+		u->claimed = false;
 		r = 0;
 	} else if (request == USBDEVFS_CLEAR_HALT) {
 		r = usbfs_clear_halt(u);
@@ -304,8 +306,10 @@ static inline void usbfs_vanished(UMockdevIoctlBase *base, UMockdevIoctlClient *
 
 	(void)base, (void)client;
 	pthread_mutex_lock(&u->lock);
-	if (--u->count.clients == 0)
+	if (--u->count.clients == 0) {
 		usbfs_forget(u);
+		u->claimed = false;
+	}
 	usbfs_signal(u);
 	pthread_mutex_unlock(&u->lock);
 }

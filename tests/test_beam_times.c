@@ -420,19 +420,21 @@ static struct bench *open_kind(const struct kind *k, double ppm, uint32_t start_
 
 static void beams_have_their_times_after_five_seconds(void **state)
 {
+	double worst[KINDS] = {0};
 	(void)state;
-	for (int k = 0; k < KINDS; k++) {
-		double worst = 0;
+	for (int k = 0; k < KINDS; k++)
 		for (double ppm = -200; ppm <= 200; ppm += 200) {
 			struct bench *b = open_kind(&kinds[k], ppm, (uint32_t)-20000000, false); /* wraps after 20 s */
 			b->jitter_ms = 3;
 			run(b, 40);
-			worst = fmax(worst, p99_ms(b));
+			worst[k] = fmax(worst[k], p99_ms(b));
 			end(b);
 		}
-		printf("note: beam times of %s, 200 ppm, delays up to 3 ms: p99 %.3f ms\n", kinds[k].name, worst);
-		assert_true(worst < 0.3);
-	}
+	printf("note: beam times, 200 ppm, delays up to 3 ms, p99 in ms:");
+	for (int k = 0; k < KINDS; k++)
+		printf(" %s %.3f%s", kinds[k].name, worst[k], k + 1 < KINDS ? "," : "\n");
+	for (int k = 0; k < KINDS; k++)
+		assert_true(worst[k] < 0.3);
 }
 
 static void without_indices_the_period_does_nearly_as_well(void **state)
@@ -464,18 +466,20 @@ static void a_mirror_that_wanders_is_timed_turn_by_turn(void **state)
 	end(b);
 }
 
+/* What is never quick while the two beat against each other cannot be known. */
 static void a_latency_timer_of_16_ms_is_seen_through(void **state)
 {
+	double worst = 0;
 	(void)state;
 	for (int k = 3; k < KINDS; k++) {
 		struct bench *b = open_kind(&kinds[k], 130, 0, false);
 		b->timer_ms = 16;
 		run(b, 50);
-		printf("note: beam times of %s behind a 16 ms timer: p99 %.2f ms\n", kinds[k].name, p99_ms(b));
-		assert_true(p99_ms(b) <
-		            5.4); /* what is never hit while the two beat against each other cannot be known */
+		worst = fmax(worst, p99_ms(b));
 		end(b);
 	}
+	printf("note: beam times of LMS2xx, indices, behind a 16 ms timer: p99 %.2f ms\n", worst);
+	assert_true(worst < 5.4);
 }
 
 /* Walls ------------------------------------------------------------------------------------------------------------ */
@@ -537,12 +541,14 @@ static void swept_walls_are_as_thin_as_with_perfect_time(void **state)
 				thickness_mm(&b->walls[way], &rms[way], &p95[way]);
 				mesh_mm(&b->walls[way], &mesh_rms[way], &mesh_p95[way]);
 			}
-			printf("note: walls swept at 37.5 degrees/s by %s, %+.0f ppm: points rms %.2f mm (perfect time "
-			       "%.2f), "
-			       "95 %% %.2f (%.2f); mesh rms %.2f (%.2f), 95 %% %.2f (%.2f)\n",
-			       kinds[swept[i]].name, ppm, rms[SAID_TIME], rms[TRUE_TIME], p95[SAID_TIME],
-			       p95[TRUE_TIME], mesh_rms[SAID_TIME], mesh_rms[TRUE_TIME], mesh_p95[SAID_TIME],
-			       mesh_p95[TRUE_TIME]);
+			if (ppm < 0)
+				printf("note: walls swept at 37.5 degrees/s by %s, %+.0f ppm: points rms %.2f mm "
+				       "(perfect time "
+				       "%.2f), "
+				       "95 %% %.2f (%.2f); mesh rms %.2f (%.2f), 95 %% %.2f (%.2f)\n",
+				       kinds[swept[i]].name, ppm, rms[SAID_TIME], rms[TRUE_TIME], p95[SAID_TIME],
+				       p95[TRUE_TIME], mesh_rms[SAID_TIME], mesh_rms[TRUE_TIME], mesh_p95[SAID_TIME],
+				       mesh_p95[TRUE_TIME]);
 			assert_true(rms[SAID_TIME] < rms[TRUE_TIME] + 2 && p95[SAID_TIME] < p95[TRUE_TIME] + 2);
 			assert_true(mesh_rms[SAID_TIME] < mesh_rms[TRUE_TIME] + 2 &&
 			            mesh_p95[SAID_TIME] < mesh_p95[TRUE_TIME] + 2);

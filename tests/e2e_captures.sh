@@ -7,12 +7,12 @@ captures=../shared/data/captures
 [ -e "$captures/cola_b/lms111_20210302.txt" ] || { echo "the captures are not here: $captures"; exit 77; }
 command -v python3 >/dev/null 2>&1 || { echo "python3 is not here: install it (make deps)"; exit 77; }
 scratch=$(mktemp -d)
-peer='' daemon=''
+peer='' daemon='' simulator=''
 unset FACETD XDG_RUNTIME_DIR FACETD_CONFIG
 finish() {
-    for pid in $daemon $peer; do kill -KILL "$pid" 2>/dev/null; done
+    for pid in $daemon $peer $simulator; do kill -KILL "$pid" 2>/dev/null; done
     wait 2>/dev/null
-    daemon='' peer=''
+    daemon='' peer='' simulator=''
 }
 trap 'finish; rm -rf "$scratch"' EXIT
 trap 'exit 1' INT TERM
@@ -38,6 +38,34 @@ sys.exit(bool(wrong))' "$@" 2>/dev/null
 
 has() {
     counts "$@" >/dev/null
+}
+
+# A captured telegram of an LMS200 in the place of a simulated one's first measurements.
+play_lms200() {
+    rm -f "$scratch"/*.log
+    "$build/facet" simulate hall --dir "$scratch/sim" >"$scratch/simulator.log" 2>&1 &
+    simulator=$!
+    wrong="the simulator does not come up"
+    until_true [ -e "$scratch/sim/laser" ] || return 1
+    python3 tests/lms2xx_peer.py "$scratch/sim/laser" "$scratch/line" "$captures/lms2xx/lms200_b0_361_mm_real.bin" 20 >"$scratch/peer.log" 2>&1 &
+    peer=$!
+    wrong="the peer does not come up"
+    until_true [ -e "$scratch/line" ] || return 1
+    cat >"$scratch/facetd.yaml" <<YAML
+devices:
+  - {name: laser, driver: lms2xx, port: "$scratch/line", baud: 38400, variant: 180/0.5, tilt: 0deg}
+  - {name: robot, driver: pose, fixed: {xyz: [0, 0, 0], rpy: [0, 0, 0]}}
+listen: {native: ["unix:$scratch/facetd.sock"]}
+YAML
+    "$build/facetd" --config "$scratch/facetd.yaml" 2>"$scratch/daemon.log" &
+    daemon=$!
+    wrong="the daemon does not ask for measurements"
+    until_true grep -q played "$scratch/peer.log" || return 1
+    set -- profiles 20 malformed 0 'raster unknown' 0 'mode unknown' 0 'mode without ranges' 0
+    until_true has "$@"
+    wrong=$(counts "$@") || return 1
+    finish
+    summary="$summary lms200 20"
 }
 
 summary='' more=''
@@ -96,5 +124,10 @@ play cola_b/lms511_20210301.txt lms5xx 136 'duplicates' 0
 play cola_b/sick_scan_xd_test.pcapng tim 16
 more=', encoder: {scale: 0.01deg}'
 play cola_a/lms5xx_encoder_rssi8_name_time_sRA.bin lms5xx 1 tilts 1
+if ! play_lms200; then
+    echo "FAILED: the LMS200's telegram: $wrong"
+    sed 's/^/    /' "$scratch"/*.log
+    failed=1
+fi
 [ $failed -eq 0 ] && echo "note: profiles decoded by the daemon, all there are:$summary"
 exit $failed

@@ -606,7 +606,7 @@ static int64_t period_ns(const struct dialogue *d)
 static int64_t silence_ns(const struct dialogue *d)
 {
 	const int64_t period = period_ns(d), most = 2 * period > SILENT_MAX ? 2 * period : SILENT_MAX;
-	const int64_t five = period ? SCANS_LOST * period : SILENT_MAX;
+	const int64_t five = period && d->intervals >= PERIODS ? SCANS_LOST * period : most; /* it may say too much */
 	return five < d->floor_ns ? d->floor_ns : five > most ? most : five;
 }
 

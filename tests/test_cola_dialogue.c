@@ -586,6 +586,10 @@ static void exactly_what_differs_is_written(void **state)
 		assert_int_equal(asked(w, "sMN SetAccessMode"), 1);
 		assert_int_equal(asked(w, "sMN LMCstartmeas"), 1);
 		assert_int_equal(asked(w, "sMN Run"), 1);
+		if (strstr(wanted[i].device, "remission")) {
+			assert_int_equal(w->scanner.data[2], 1);
+			assert_int_equal(w->scanner.data[3], strstr(wanted[i].device, "16") != NULL);
+		}
 		reopen(w); /* and the next time it is as wanted */
 		run(w, 2 * SECONDS);
 		assert_streams(w);
@@ -680,6 +684,10 @@ static void a_dialect_that_nobody_speaks_is_said(void **state)
 	run(w, 10 * SECONDS);
 	assert_failed(w, "no scanner answers, in CoLa-A or in CoLa-B");
 	assert_true(w->now_ns - 5 * SECONDS <= 2 * SECONDS);
+	assert_int_equal(w->requests, 4);
+	reopen(w); /* and as often the next time */
+	run(w, 10 * SECONDS);
+	assert_int_equal(w->requests, 4);
 	destroy(w);
 }
 
@@ -691,7 +699,8 @@ static void an_answer_that_comes_late_still_tells_the_dialect(void **state)
 	w->scanner.trouble = "LMDscandata";
 	w->scanner.kind = LATE;
 	w->scanner.delay_ns = 600 * MS;
-	run(w, 900 * MS);
+	run(w, 700 * MS);
+	assert_int_equal(asked(w, "sRN DeviceIdent"), 1); /* at once, in the dialect of the answer */
 	w->scanner.kind = NO_TROUBLE;
 	run(w, 2 * SECONDS);
 	assert_streams(w);
@@ -1046,6 +1055,13 @@ static void a_refusal_is_not_repeated_fast_and_not_kept_for_long(void **state)
 	}
 	assert_int_equal(times, 3);
 	assert_streams(w);
+	w->scanner.trouble_times = 2; /* it streamed meanwhile: told at once */
+	reopen(w);
+	const int64_t again_ns = w->now_ns;
+	w->scanner.every = 1;
+	run(w, 5 * SECONDS);
+	assert_failed(w, "a value is out of its limits");
+	assert_true(w->now_ns - again_ns < SECONDS);
 	destroy(w);
 }
 
@@ -1081,7 +1097,7 @@ static void a_slow_stream_is_no_dead_one(void **state)
 	for (int few = 0; few < 2; few++) {
 		struct world *w = create(TIM);
 		w->scanner.few = few;
-		w->scanner.period_ns = few ? 900 * MS : 250 * MS;
+		w->scanner.period_ns = few ? 900 * MS : 400 * MS;
 		run(w, 60 * SECONDS);
 		assert_streams(w);
 		destroy(w);
@@ -1287,6 +1303,27 @@ static void a_link_that_is_lost_at_any_moment_begins_anew(void **state)
 	}
 }
 
+static void an_answer_to_another_request_is_none(void **state)
+{
+	static const char text[] = "sRA LMDscandatacfg 01 00 0 0 0 00 00 0 0 0 0 +7";
+	const struct reply reply = {.payload = (const uint8_t *)text, .len = sizeof text - 1, .kind = COLA_READ};
+	int tried = 0;
+	(void)state;
+	for (int64_t after_ns = 0; after_ns < 100 * MS; after_ns += MS) {
+		struct world *w = create(LMS1XX ", every: 1");
+		run(w, after_ns);
+		if (!is(w->request[w->requests - 1], "sRN LMDscandatacfg")) {
+			cola_dialogue_reply(w->dialogue, &reply);
+			tried++;
+		}
+		run(w, 2 * SECONDS);
+		assert_streams(w);
+		assert_int_equal(changes(w), 0);
+		destroy(w);
+	}
+	assert_true(tried > 80);
+}
+
 static void answers_that_are_cut_or_nonsense_do_no_harm(void **state)
 {
 	static const char *const texts[] = {"sRA LMPscancfg",
@@ -1362,6 +1399,7 @@ int main(void)
 	    cmocka_unit_test(the_end_switches_the_stream_off),
 	    cmocka_unit_test(a_stop_at_any_moment_ends_in_peace),
 	    cmocka_unit_test(a_link_that_is_lost_at_any_moment_begins_anew),
+	    cmocka_unit_test(an_answer_to_another_request_is_none),
 	    cmocka_unit_test(answers_that_are_cut_or_nonsense_do_no_harm),
 	};
 	return cmocka_run_group_tests(tests, NULL, NULL);

@@ -21,6 +21,7 @@ struct run {
 	struct mesher *mesher;
 	struct patch_store *store;
 	uint64_t rows, rows_a_commit;
+	char snapshot[65]; /* hash of the assembler's, half way; empty: there was none */
 };
 
 static void commit(struct run *run)
@@ -96,6 +97,25 @@ static void drain(struct run *run, int64_t log_ns, bool end)
 	}
 }
 
+/* Law L7: the drive goes on from a snapshot of the assembler in another one, and the map is the same. */
+static void change_sweeps(struct run *run, const struct sweep_params *params)
+{
+	static uint8_t bytes[1 << 20];
+	struct sha256 sha;
+	struct state s;
+	state_save(&s, bytes, sizeof bytes);
+	sweep_state(&s, run->sweep);
+	sha256_init(&sha);
+	sha256_add(&sha, bytes, s.at);
+	sha256_hex(&sha, run->snapshot);
+	sweep_destroy(run->sweep);
+	run->sweep = sweep_create(params);
+	state_load(&s, bytes, s.at);
+	sweep_state(&s, run->sweep);
+	if (!state_done(&s))
+		snprintf(run->snapshot, sizeof run->snapshot, "refused");
+}
+
 /* Two half sweeps, down and up again, while the robot creeps forward and turns a little. */
 static void drive(struct run *run)
 {
@@ -124,6 +144,8 @@ static void drive(struct run *run)
 		measure(&p, &params, tilt_rad, &pose, &noise);
 		sweep_profile(run->sweep, &p, t + 2 * TURN_NS);
 		drain(run, t, false);
+		if (i == 100)
+			change_sweeps(run, &params);
 	}
 	drain(run, INT64_MAX / 2, true);
 	map_flush(run->map);
@@ -209,6 +231,9 @@ int main(int argc, char **argv)
 	commit(&run);
 	char hash[65];
 	patch_store_hash(run.store, hash);
-	printf("%s %zu patches %llu rows\n", hash, patch_store_count(run.store), (unsigned long long)run.rows);
+	printf("%s %zu patches %llu rows", hash, patch_store_count(run.store), (unsigned long long)run.rows);
+	if (*run.snapshot)
+		printf(" snapshot %.16s", run.snapshot);
+	printf("\n");
 	return 0;
 }

@@ -47,12 +47,50 @@ struct link {
 
 struct bus { /* the thread's own; it frees it */
 	int fd;
+	int crowd; /* its place among those of its device */
 	struct config_device device;
 	modbus_t *modbus;
 	bool serial;
 	int64_t silence_ns, free_ns; /* the line may be used from then on */
 	int failures;
 };
+
+/* Threads of each device that have not ended. One that is closed ends within seconds, unless a name server never answers:
+ * nothing can wake it there, and each new try would leave one more. */
+static struct {
+	char device[CONFIG_NAME_MAX];
+	int threads; /* 0: the place is free */
+} crowd[CONFIG_DEVICES_MAX];
+static pthread_mutex_t crowd_lock = PTHREAD_MUTEX_INITIALIZER;
+
+/* Its place, or -EBUSY: too many of them wait already. */
+static int crowd_join(const char *device)
+{
+	int place = -1;
+
+	pthread_mutex_lock(&crowd_lock);
+	for (int i = 0; i < CONFIG_DEVICES_MAX; i++)
+		if (crowd[i].threads > 0 && strcmp(crowd[i].device, device) == 0)
+			place = i;
+	for (int i = 0; i < CONFIG_DEVICES_MAX && place < 0; i++)
+		if (crowd[i].threads == 0)
+			place = i;
+	if (place >= 0 && crowd[place].threads < MODBUS_THREADS_MAX) {
+		snprintf(crowd[place].device, sizeof crowd[place].device, "%s", device);
+		crowd[place].threads++;
+	} else {
+		place = -EBUSY;
+	}
+	pthread_mutex_unlock(&crowd_lock);
+	return place;
+}
+
+static void crowd_leave(int place)
+{
+	pthread_mutex_lock(&crowd_lock);
+	crowd[place].threads--;
+	pthread_mutex_unlock(&crowd_lock);
+}
 
 static int64_t monotonic_ns(void)
 {
@@ -316,6 +354,7 @@ static void *bus_thread(void *arg)
 	bus_disconnect(bus);
 	(void)!send(bus->fd, &lost, sizeof lost, MSG_DONTWAIT | MSG_NOSIGNAL);
 	close(bus->fd);
+	crowd_leave(bus->crowd);
 	free(bus);
 	return NULL;
 }
@@ -374,9 +413,20 @@ struct link *modbus_bus_open(const struct config_device *device, char error[160]
 	bus->fd = pair[1];
 	bus->device = *device;
 	bus->serial = is_serial(device->connect);
+	bus->crowd = crowd_join(device->name);
+	if (bus->crowd < 0) {
+		snprintf(
+		    error, 160,
+		    "%.50s: %d earlier tries have not ended; does the name server answer? A numeric address needs none",
+		    device->connect, MODBUS_THREADS_MAX);
+		close(pair[0]);
+		close(pair[1]);
+		goto fail_said;
+	}
 	r = start_thread(bus);
 	if (!r)
 		return link;
+	crowd_leave(bus->crowd);
 	close(pair[0]);
 	close(pair[1]);
 fail:

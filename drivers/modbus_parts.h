@@ -8,6 +8,8 @@
 
 #define MODBUS_PERIOD_MIN_NS 2000000 /* between polls: nobody needs more than 500 angles a second */
 
+#define MODBUS_THREADS_MAX 4 /* of one device, at the limit it is not opened: see modbus_bus.c */
+
 /* Kinds of `struct reply`. */
 enum modbus_reply {
 	MODBUS_ANGLE,   /* payload: one double, rad, as decoded */

@@ -6,10 +6,12 @@
 
 #include <cmocka.h>
 
+#include <dlfcn.h>
 #include <errno.h>
 #include <fcntl.h>
 #include <math.h>
 #include <modbus.h>
+#include <netdb.h>
 #include <netinet/in.h>
 #include <poll.h>
 #include <pthread.h>
@@ -876,6 +878,81 @@ static void a_line_in_use_is_left_alone(void **state)
 	sim_servo_destroy(servo);
 }
 
+/* A resolver that does not answer until it is let go. */
+static pthread_mutex_t resolver_lock = PTHREAD_MUTEX_INITIALIZER;
+static pthread_cond_t resolver_changed = PTHREAD_COND_INITIALIZER;
+static bool resolver_answers;
+static int resolver_waiting;
+
+int getaddrinfo(const char *node, const char *service, const struct addrinfo *hints, struct addrinfo **ret)
+{
+	int (*real)(const char *, const char *, const struct addrinfo *, struct addrinfo **);
+
+	if (node && !strcmp(node, "never.answers")) {
+		pthread_mutex_lock(&resolver_lock);
+		resolver_waiting++;
+		pthread_cond_broadcast(&resolver_changed);
+		while (!resolver_answers)
+			pthread_cond_wait(&resolver_changed, &resolver_lock);
+		resolver_waiting--;
+		pthread_cond_broadcast(&resolver_changed);
+		pthread_mutex_unlock(&resolver_lock);
+		return EAI_FAIL;
+	}
+	*(void **)&real = dlsym(RTLD_NEXT, "getaddrinfo");
+	return real(node, service, hints, ret);
+}
+
+static void await_resolver(int waiting)
+{
+	pthread_mutex_lock(&resolver_lock);
+	while (resolver_waiting != waiting)
+		pthread_cond_wait(&resolver_changed, &resolver_lock);
+	pthread_mutex_unlock(&resolver_lock);
+}
+
+static void a_resolver_that_hangs_costs_a_bounded_number_of_threads(void **state)
+{
+	struct sim_servo_params params = {.rtu = rtu, .slave = 1};
+	struct config config = servo_config(), other = servo_config();
+	uint8_t buf[MODBUS_WIRE_MAX];
+	char error[160] = "";
+	struct sim_servo *servo = sim_servo_create(&params, error);
+	struct link *link = NULL;
+	int64_t t_ns;
+
+	(void)state;
+	strcpy(config.device[0].name, "distant");
+	strcpy(config.device[0].connect, "never.answers:502");
+	for (int i = 0; i < MODBUS_THREADS_MAX; i++) {
+		link = driver_modbus.link_open(&config.device[0], error);
+		assert_non_null(link);
+		driver_modbus.link_close(link);
+	}
+	await_resolver(MODBUS_THREADS_MAX);
+	for (int i = 0; i < 100; i++)
+		assert_null(driver_modbus.link_open(&config.device[0], error));
+	assert_non_null(strstr(error, "4 earlier tries"));
+	/* Another device is not concerned. */
+	strcpy(other.device[0].connect, rtu);
+	link = driver_modbus.link_open(&other.device[0], error);
+	assert_non_null(link);
+	assert_true(await(link, buf, sizeof buf, &t_ns) > 0);
+	driver_modbus.link_close(link);
+	pthread_mutex_lock(&resolver_lock);
+	resolver_answers = true;
+	pthread_cond_broadcast(&resolver_changed);
+	pthread_mutex_unlock(&resolver_lock);
+	/* They end, and the device can be opened again. */
+	link = NULL;
+	for (int i = 0; i < 2000 && !link; i++, usleep(10000))
+		link = driver_modbus.link_open(&config.device[0], error);
+	assert_non_null(link);
+	assert_true(until_lost(link) < 0);
+	driver_modbus.link_close(link);
+	sim_servo_destroy(servo);
+}
+
 /* A peer that answers the first request only after its time-out, and each answer carries its number. */
 struct late_peer {
 	int master;
@@ -983,6 +1060,7 @@ int main(void)
 	    cmocka_unit_test(a_lost_bus_is_reported_and_can_be_opened_again),
 	    cmocka_unit_test(a_host_that_refuses_costs_the_loop_nothing),
 	    cmocka_unit_test(a_line_in_use_is_left_alone),
+	    cmocka_unit_test(a_resolver_that_hangs_costs_a_bounded_number_of_threads),
 	    cmocka_unit_test(a_late_answer_is_never_taken_for_the_next_one),
 	};
 

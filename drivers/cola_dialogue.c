@@ -114,8 +114,8 @@ static const struct exchange {
     [STAGE_START] = {"sMN", "LMCstartmeas", COLA_METHOD, WRITE_NS, 2, true, NULL},
     [STAGE_RUN] = {"sMN", "Run", COLA_METHOD, WRITE_NS, 2, true, NULL},
     [STAGE_READY] = {"sRN", "STlms", COLA_READ, READ_NS, 3, true, NULL},
-    [STAGE_STREAM] = {"sEN", "LMDscandata", COLA_EVENT, READ_NS, 3, false, "it may be no scanner"},
-    [STAGE_STREAM_SAFE] = {"sEN", "LMDscandatamon", COLA_EVENT, READ_NS, 3, false, "it may be no scanner"},
+    [STAGE_STREAM] = {"sEN", "LMDscandata", COLA_EVENT, READ_NS, 3, false, "switch it off and on"},
+    [STAGE_STREAM_SAFE] = {"sEN", "LMDscandatamon", COLA_EVENT, READ_NS, 3, false, "switch it off and on"},
     [STAGE_STOP] = {"sEN", "LMDscandata", COLA_EVENT, PROBE_NS, 1, true, NULL},
 };
 
@@ -524,14 +524,15 @@ static void go_on(struct dialogue *d, int64_t t_ns)
 
 static void take_error(struct dialogue *d, uint32_t code, int64_t t_ns)
 {
-	enum { BUSY = 0xd, EVENT_UNKNOWN = 0xf };
+	enum { VARIABLE_UNKNOWN = 3, BUSY = 0xd, EVENT_UNKNOWN = 0xf };
+	const bool unknown = code == EVENT_UNKNOWN || code == VARIABLE_UNKNOWN;
 	if (code == BUSY && d->stage != STAGE_STOP && ++d->busy <= BUSY_MAX) {
 		d->ask = ASK_PAUSING;
 		d->until_ns = t_ns + BUSY_NS;
 	} else if (d->stage == STAGE_PROBE && code == EVENT_UNKNOWN) {
 		d->safe = true;
 		enter(d, STAGE_PROBE_SAFE);
-	} else if (d->stage == STAGE_STREAM) {
+	} else if (d->stage == STAGE_STREAM && unknown) {
 		enter(d, STAGE_STREAM_SAFE);
 	} else if (d->stage == STAGE_LOGIN || d->stage == STAGE_LOGIN_SAFE) {
 		struct cola_reader nothing = {.dialect = d->dialect, .failed = true};

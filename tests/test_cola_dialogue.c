@@ -811,6 +811,22 @@ static void every_error_code_of_a_write_is_told_in_words_and_of_a_read_it_is_no_
 		}
 }
 
+static void a_refused_stream_is_told_by_its_own_name_and_reason(void **state)
+{
+	(void)state;
+	for (uint32_t code = 1; code <= 0x1a; code++) {
+		struct world *w = create(TIM);
+		w->scanner.kind = REFUSE;
+		w->scanner.code = code;
+		w->scanner.trouble = "LMDscandata";
+		w->scanner.trouble_times = -1;
+		run(w, 60 * SECONDS);
+		assert_failed(w, code == 3 || code == 0xf ? "LMDscandatamon: event unknown" : "refuses LMDscandata: ");
+		assert_failed(w, code == 3 ? "event unknown" : cola_error_text(code));
+		destroy(w);
+	}
+}
+
 static void any_one_request_may_be_refused_or_unanswered_once(void **state)
 {
 	static const char *const names[] = {
@@ -1374,6 +1390,7 @@ int main(void)
 	    cmocka_unit_test(a_safety_scanner_streams_under_its_other_name),
 	    cmocka_unit_test(a_tim_that_knows_few_variables_streams),
 	    cmocka_unit_test(every_error_code_of_a_write_is_told_in_words_and_of_a_read_it_is_no_harm),
+	    cmocka_unit_test(a_refused_stream_is_told_by_its_own_name_and_reason),
 	    cmocka_unit_test(any_one_request_may_be_refused_or_unanswered_once),
 	    cmocka_unit_test(whoever_stops_answering_is_said_with_the_request),
 	    cmocka_unit_test(a_result_that_comes_later_is_waited_for),

@@ -2,15 +2,17 @@
 
     python3 tests/lms2xx_peer.py LINE LINK CAPTURE TIMES     LINE: the simulator's; LINK: where the daemon shall look
 
-The dialogue passes as it is, the line's rate too. After TIMES measurements it says so on stdout and lets no more of them through.
+The dialogue passes as it is, the line's rate too. After TIMES measurements it says so on stdout and lets nothing through any more.
 """
 import fcntl
 import os
 import select
 import sys
+import time
 import tty
 
 MEASUREMENT, LONGEST = 0xB0, 900
+HEAD = b"\x02\x80"
 TCGETS2, TCSETS2 = 0x802C542A, 0x402C542B
 SILENCE_S = 0.2  # what was begun before it was no telegram
 
@@ -52,9 +54,9 @@ def main(line, link, capture, times):
     tty.setraw(device)
     tty.setraw(terminal)
     os.symlink(os.ttyname(terminal), link)
-    while True:
+    while left > 0:
         ready = select.select([device, host], [], [], SILENCE_S)[0]
-        if not ready and rest:
+        if not ready and rest and rest[:2] != HEAD:
             os.write(host, rest)
             rest = b""
         if host in ready:
@@ -69,8 +71,9 @@ def main(line, link, capture, times):
             elif left > 0:
                 os.write(host, captured)
                 left -= 1
-                if left == 0:
-                    print("played", flush=True)
+    print("played", flush=True)
+    while True:
+        time.sleep(1)
 
 
 if __name__ == "__main__":

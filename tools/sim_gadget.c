@@ -45,8 +45,9 @@ struct sim_gadget {
 	uv_timer_t timer, replug;
 	uv_work_t plug;
 	int handles;           /* open */
-	bool plugging, wanted; /* a plug is being done; what is wanted after it: in or out */
-	bool plugged, again;   /* as it stands; out, and in again at once */
+	bool plugging, wanted; /* a plug is being done; whether somebody wants it in */
+	int plug_result;
+	bool plugged, again; /* as it stands; out, and in again at once */
 	bool enabled, ending;
 	bool in_busy, out_busy;
 	bool halt, halted;         /* to be halted when idle; is */
@@ -241,30 +242,6 @@ static void on_timer(uv_timer_t *timer)
 	pump(timer->data);
 }
 
-/* All that can go on goes on, and the timer is set to when it goes on next. */
-static void pump(struct sim_gadget *gadget)
-{
-	const struct sim_device *device = &gadget->device;
-	const int64_t t_ns = (int64_t)uv_hrtime();
-	if (gadget->ending)
-		return;
-	device->advance(device->ctx, t_ns);
-	if (gadget->enabled && !gadget->in_busy) {
-		if (gadget->halt)
-			halt_now(gadget);
-		const bool sent = send_next(gadget);
-		if (!sent && device->awaits != NULL && device->awaits(device->ctx))
-			device->taken(device->ctx, t_ns);
-	}
-	listen_to_host(gadget);
-	const int64_t deadline_ns = device->deadline(device->ctx);
-	if (deadline_ns == INT64_MAX)
-		uv_timer_stop(&gadget->timer);
-	else
-		uv_timer_start(&gadget->timer, on_timer,
-		               deadline_ns > t_ns ? (uint64_t)(deadline_ns - t_ns + NS_PER_MS - 1) / NS_PER_MS : 1, 0);
-}
-
 /* ---- the host comes and goes ---- */
 
 static void set_enabled(struct sim_gadget *gadget, bool enabled)
@@ -322,7 +299,7 @@ static void next_plug(struct sim_gadget *);
 static void do_plug(uv_work_t *work)
 {
 	struct sim_gadget *gadget = work->data;
-	usb_gadget_plug(&gadget->usb, !gadget->plugged);
+	gadget->plug_result = usb_gadget_plug(&gadget->usb, !gadget->plugged);
 }
 
 static void plug_done(uv_work_t *work, int status)
@@ -330,13 +307,24 @@ static void plug_done(uv_work_t *work, int status)
 	struct sim_gadget *gadget = work->data;
 	(void)status;
 	gadget->plugging = false;
-	gadget->plugged = !gadget->plugged;
+	if (gadget->plug_result < 0)
+		gadget->wanted =
+		    gadget->plugged; /* the controller is gone: it stays as it is until somebody wants it */
+	else
+		gadget->plugged = !gadget->plugged;
 	if (gadget->again && !gadget->plugged)
 		gadget->again = false;
 	next_plug(gadget);
 }
 
 static void finish(struct sim_gadget *);
+
+/* In, when somebody wants it in and it has power. */
+static bool should_be_in(const struct sim_gadget *gadget)
+{
+	const struct sim_device *device = &gadget->device;
+	return gadget->wanted && (device->alive == NULL || device->alive(device->ctx));
+}
 
 /* One change at a time; the next when it is done. */
 static void next_plug(struct sim_gadget *gadget)
@@ -347,7 +335,7 @@ static void next_plug(struct sim_gadget *gadget)
 		finish(gadget);
 		return;
 	}
-	if (gadget->wanted == gadget->plugged && !gadget->again)
+	if (should_be_in(gadget) == gadget->plugged && !gadget->again)
 		return;
 	if (!gadget->plugged) {
 		gadget->plugged_ns = (int64_t)uv_hrtime();
@@ -355,6 +343,31 @@ static void next_plug(struct sim_gadget *gadget)
 		gadget->seen.first_request_ns = -1;
 	}
 	gadget->plugging = uv_queue_work(gadget->control.loop, &gadget->plug, do_plug, plug_done) == 0;
+}
+
+/* All that can go on goes on, and the timer is set to when it goes on next. */
+static void pump(struct sim_gadget *gadget)
+{
+	const struct sim_device *device = &gadget->device;
+	const int64_t t_ns = (int64_t)uv_hrtime();
+	if (gadget->ending)
+		return;
+	device->advance(device->ctx, t_ns);
+	next_plug(gadget); /* it may have lost its power, or got it back */
+	if (gadget->enabled && !gadget->in_busy) {
+		if (gadget->halt)
+			halt_now(gadget);
+		const bool sent = send_next(gadget);
+		if (!sent && device->awaits != NULL && device->awaits(device->ctx))
+			device->taken(device->ctx, t_ns);
+	}
+	listen_to_host(gadget);
+	const int64_t deadline_ns = device->deadline(device->ctx);
+	if (deadline_ns == INT64_MAX)
+		uv_timer_stop(&gadget->timer);
+	else
+		uv_timer_start(&gadget->timer, on_timer,
+		               deadline_ns > t_ns ? (uint64_t)(deadline_ns - t_ns + NS_PER_MS - 1) / NS_PER_MS : 1, 0);
 }
 
 static void want(struct sim_gadget *gadget, bool in)

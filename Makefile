@@ -147,6 +147,8 @@ bench:
 	@bench/run
 
 soak: all tests
+	@echo 'an hour of chaos in virtual time:'
+	@$(B)/tests/test_chaos 3600
 	@tests/soak $(B)
 
 FUZZ_SECONDS ?= 300

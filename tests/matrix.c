@@ -198,6 +198,19 @@ static void check_flow(const struct play *p, const struct rig_view *view)
 		fail_msg("%s: data %lld ms after its end", p->row->name, (long long)(p->again_ns / RIG_MS));
 }
 
+/* Whoever is there again is asked within 2 s, whatever its driver needs then. */
+static void check_first_request(const struct play *p, const struct rig_view *view)
+{
+	static const char *const away[] = {"unplug", "refuse", "hang", NULL};
+	int64_t end_ns = p->end_ns;
+
+	if (!p->row->fault[0].kind || !among(away, p->row->fault[0].kind) || p->row->fault[0].for_ns == 0)
+		return;
+	if (view->first_request_ns < end_ns || view->first_request_ns > end_ns + 2 * RIG_SECOND)
+		fail_msg("%s: the first request came %lld ms after it was there again", p->row->name,
+		         (long long)((view->first_request_ns - end_ns) / RIG_MS));
+}
+
 static void check(const struct play *p)
 {
 	struct rig_view view;
@@ -206,6 +219,7 @@ static void check(const struct play *p)
 	rig_view(p->rig, p->bench->device, &view);
 	losses = view.line.losses - p->losses;
 	check_flow(p, &view);
+	check_first_request(p, &view);
 	check_counters(p);
 	check_log(p);
 	check_account(p, &view);

@@ -433,6 +433,16 @@ static int64_t due_ns(const struct line *line)
 	return due_ns;
 }
 
+/* A host that slept, or was busy, finds deadlines that passed and bytes that came in time: the bytes are heard first, else a
+ * device that answered is given up. */
+static void keep_deadline(struct supervisor *s, struct line *line, int64_t t_ns)
+{
+	bool reads = line->dialogue && !line->paused && line->driver->link_fd(line->link) >= 0;
+
+	if (!reads || read_line(s, line, t_ns))
+		converse(s, line, t_ns);
+}
+
 void supervisor_timer(struct supervisor *s, int64_t t_ns)
 {
 	for (int i = 0; i < s->config->devices; i++) {
@@ -449,7 +459,7 @@ void supervisor_timer(struct supervisor *s, int64_t t_ns)
 		if (line->status.state == SUPERVISOR_BACKING_OFF)
 			open_line(s, line, t_ns);
 		else if (line->link)
-			converse(s, line, t_ns);
+			keep_deadline(s, line, t_ns);
 	}
 }
 

@@ -438,6 +438,23 @@ static void a_silent_device_is_given_up_with_its_sentence(void **state)
 	end();
 }
 
+static void a_host_that_slept_hears_what_came_meanwhile_before_it_judges(void **state)
+{
+	(void)state;
+	begin(&fake, NULL, NULL);
+	say(0, "hi", 10 * MS);
+	while (watched_writable[0])
+		supervisor_ready(supervisor, 0, false, true, 11 * MS);
+	expect_state(0, SUPERVISOR_STREAMING);
+	strcpy(world[0].pending, "d");
+	supervisor_timer(supervisor, 5 * SECOND); /* the loop calls timers before it looks at descriptors */
+	expect_state(0, SUPERVISOR_STREAMING);
+	assert_int_equal(supervisor_device(supervisor, 0)->decoded, 1);
+	supervisor_timer(supervisor, 6 * SECOND);
+	expect_state(0, SUPERVISOR_BACKING_OFF);
+	end();
+}
+
 static void a_failed_write_loses_the_device(void **state)
 {
 	(void)state;
@@ -681,6 +698,7 @@ int main(void)
 	    cmocka_unit_test(a_lost_device_comes_back_and_both_are_told),
 	    cmocka_unit_test(a_device_that_fails_right_after_it_streams_backs_off_further),
 	    cmocka_unit_test(a_silent_device_is_given_up_with_its_sentence),
+	    cmocka_unit_test(a_host_that_slept_hears_what_came_meanwhile_before_it_judges),
 	    cmocka_unit_test(a_failed_write_loses_the_device),
 	    cmocka_unit_test(no_device_stalls_another),
 	    cmocka_unit_test(a_device_without_a_link_just_streams),

@@ -455,7 +455,14 @@ int watch_main(int argc, char **argv)
 	    "[ADDRESS]",
 	    "What a running daemon does, live.\v"
 	    "ADDRESS is unix:PATH or tcp:HOST:PORT; default: $FACETD, the user's own socket, "
-	    "the system's.",
+	    "the system's.\n\n"
+	    "RATE is what came a second, of what the device says it measures; JITTER how far arrivals are behind the "
+	    "least "
+	    "delayed ones (median, 99 %); LOST what the device counted and nobody received, - where it does not count. "
+	    "Under "
+	    "a device: why it does not stream, what is not as it was wanted, its clock against ours (+ runs fast), and "
+	    "what "
+	    "became of its telegrams, by reason.",
 	    NULL,
 	    NULL,
 	    NULL};

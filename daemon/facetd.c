@@ -21,7 +21,8 @@ struct arguments {
 static const struct argp_option options[] = {
     {"config", 'c', "FILE", 0, "configuration (default: $FACETD_CONFIG, then " CONFIG_DEFAULT ")", 0},
     {"check-config", OPTION_CHECK, NULL, 0, "say whether the configuration is right, and end", 0},
-    {"journal", OPTION_JOURNAL, "FILE", 0, "keep what the devices sent in FILE, for tests and the search for faults",
+    {"journal", OPTION_JOURNAL, "FILE", 0,
+     "keep what the devices sent in FILE, after each ?RESET in FILE.2 and so on, for tests and the search for faults",
      0},
     {"manual", OPTION_MANUAL, NULL, 0, "print the manual of the configuration, itself a configuration with every key",
      0},

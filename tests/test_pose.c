@@ -376,6 +376,26 @@ static void times_follow_the_wall_clock_when_it_is_set(void **state)
 	driver_pose.decoder_destroy(decoder);
 }
 
+static void dated_poses_tell_the_jitter_and_others_do_not(void **state)
+{
+	struct config_device device = {.name = "pose"};
+	struct decoder *decoder = driver_pose.decoder_create(&device, 3);
+	struct decoder_timing timing;
+
+	(void)state;
+	dated(decoder, "");
+	driver_pose.timing(decoder, &timing);
+	assert_false(timing.known);
+	for (int i = 0; i < 99; i++)
+		dated(decoder, "\"t\": 1732200000.490, ");
+	dated(decoder, "\"t\": 1732200000.460, ");
+	driver_pose.timing(decoder, &timing);
+	assert_true(timing.known && timing.expected_hz == 0);
+	assert_in_range(timing.jitter_p50_ns, 0, 1000);
+	assert_in_range(timing.jitter_p99_ns, 29999000, 30001000);
+	driver_pose.decoder_destroy(decoder);
+}
+
 int main(void)
 {
 	const struct CMUnitTest tests[] = {
@@ -395,6 +415,7 @@ int main(void)
 	    cmocka_unit_test(a_fixed_pose_needs_no_descriptor),
 	    cmocka_unit_test(verdicts_are_counted_by_reason),
 	    cmocka_unit_test(times_follow_the_wall_clock_when_it_is_set),
+	    cmocka_unit_test(dated_poses_tell_the_jitter_and_others_do_not),
 	};
 
 	return cmocka_run_group_tests(tests, make_dir, remove_dir);

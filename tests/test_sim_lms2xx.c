@@ -202,6 +202,7 @@ static void stop_sim(struct rig *rig)
 static int setup(void **state)
 {
 	struct rig *rig = calloc(1, sizeof *rig);
+	*state = rig;
 	strcpy(rig->dir, "/tmp/facet-sim-XXXXXX");
 	if (mkdtemp(rig->dir) == NULL)
 		return -1;
@@ -213,7 +214,6 @@ static int setup(void **state)
 	*device = (struct config_device){.baud = 500000, .fov_deg = 180, .resolution_cdeg = 50, .mode = -1};
 	snprintf(device->port, sizeof device->port, "%s", rig->port);
 	rig->config->devices = 1;
-	*state = rig;
 	return 0;
 }
 

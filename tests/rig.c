@@ -205,41 +205,43 @@ static struct transform laser_at(struct scanner *s, int64_t t_ns)
 	return transform_compose(&t, &s->tilt_laser);
 }
 
-static void cast_beam(struct scanner *s, const struct profile *p, int k, struct truth *truth)
+static void set_truth(struct truth *truth, int k, double bearing, double range, const struct transform *laser)
 {
-	int64_t t_ns = p->t_ns + (int64_t)(k % p->interlace) * p->turn_ns + (int64_t)(k / p->interlace) * p->beam_ns;
-	struct transform laser = laser_at(s, t_ns);
-	double bearing = p->first_rad + k * p->step_rad, range;
-	struct vec3 beam = {trig_cos(bearing), trig_sin(bearing), 0.0};
-	struct vec3 d = transform_direction(&laser, beam);
+	struct vec3 beam = {range * trig_cos(bearing), range * trig_sin(bearing), 0.0};
+	struct vec3 point = transform_point(laser, beam);
 
-	range = world_cast(s->rig->world, laser.t, d, REACH_M);
 	truth->range_m[k] = (float)range;
-	truth->point_m[k][0] = (float)(laser.t.x + range * d.x);
-	truth->point_m[k][1] = (float)(laser.t.y + range * d.y);
-	truth->point_m[k][2] = (float)(laser.t.z + range * d.z);
-}
-
-/* Beams that are not cast repeat the last one that was; their points are where this range leads. */
-static void repeat_beam(struct scanner *s, const struct profile *p, int k, float range_m, struct truth *truth)
-{
-	int64_t t_ns = p->t_ns + (int64_t)(k % p->interlace) * p->turn_ns + (int64_t)(k / p->interlace) * p->beam_ns;
-	struct transform laser = laser_at(s, t_ns);
-	double bearing = p->first_rad + k * p->step_rad;
-	struct vec3 beam = {range_m * trig_cos(bearing), range_m * trig_sin(bearing), 0.0};
-	struct vec3 point = transform_point(&laser, beam);
-
-	truth->range_m[k] = range_m;
 	truth->point_m[k][0] = (float)point.x;
 	truth->point_m[k][1] = (float)point.y;
 	truth->point_m[k][2] = (float)point.z;
+}
+
+/* Of each turn of the mirror every n-th beam is cast from where the scanner is then; those up to the next one of that turn
+ * have its range and, for so short a time, its place. */
+static void cast_beams(struct scanner *s, const struct profile *p, struct truth *truth)
+{
+	int thin = s->rig->params.thin > 1 ? s->rig->params.thin : 1;
+	struct transform laser[4] = {0};
+	double range[4] = {0};
+
+	for (int k = 0; k < p->n; k++) {
+		int turn = k % p->interlace & 3, at = k / p->interlace;
+		double bearing = p->first_rad + k * p->step_rad;
+		struct vec3 beam = {trig_cos(bearing), trig_sin(bearing), 0.0};
+
+		if (at % thin == 0) {
+			laser[turn] = laser_at(s, p->t_ns + (int64_t)turn * p->turn_ns + (int64_t)at * p->beam_ns);
+			range[turn] =
+			    world_cast(s->rig->world, laser[turn].t, transform_direction(&laser[turn], beam), REACH_M);
+		}
+		set_truth(truth, k, bearing, range[turn], &laser[turn]);
+	}
 }
 
 static void scan(void *ctx, struct profile *p)
 {
 	struct scanner *s = ctx;
 	struct truth *truth = &s->truth[s->truths++ % TRUTHS];
-	int thin = s->rig->params.thin > 1 ? s->rig->params.thin : 1;
 
 	truth->t_ns = p->t_ns;
 	truth->turn_ns = p->turn_ns;
@@ -247,11 +249,8 @@ static void scan(void *ctx, struct profile *p)
 	truth->n = p->n;
 	truth->first_rad = p->first_rad;
 	truth->step_rad = p->step_rad;
+	cast_beams(s, p, truth);
 	for (int k = 0; k < p->n; k++) {
-		if (k % thin == 0)
-			cast_beam(s, p, k, truth);
-		else
-			repeat_beam(s, p, k, truth->range_m[k - k % thin], truth);
 		p->state[k] = truth->range_m[k] > 0 ? BEAM_OK : BEAM_NO_ECHO;
 		p->range_m[k] = truth->range_m[k] > 0 ? truth->range_m[k] : 0;
 	}

@@ -43,7 +43,7 @@ struct rig_params {
 	const char *yaml;  /* the devices; a modbus device is the servo, a pose device the localisation */
 	const char *world; /* of tools/simulator.h; NULL: "hall" */
 	uint64_t seed;
-	int thin;         /* every n-th beam is cast, those between lie on the chord; 0, 1: every one */
+	int thin;         /* every n-th beam is cast, those behind it repeat it; 0, 1: every one */
 	int64_t delay_ns; /* of the lines: every piece of bytes is late by a tenth of it up to all of it; 0: 300 us */
 	bool stand;       /* the robot does not drive */
 };

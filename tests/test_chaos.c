@@ -173,16 +173,16 @@ static void judge(struct rig *rig, const struct victim *v)
 	for (size_t i = 0; i < sizeof(left_out) / sizeof(left_out[0]); i++)
 		if (rig_count(rig, v->name, left_out[i]) > 0)
 			out += rig_count(rig, v->name, left_out[i]);
-	printf("note: %s: %llu faults, %llu losses; %llu telegrams sent, %llu decoded, %llu fell under the line, %lld "
+	printf("%s%s: %llu faults, %llu losses; %llu telegrams sent, %llu decoded, %llu fell under the line, %lld "
 	       "left out, "
 	       "%llu left wrong, %llu never left; %.4f %% of %llu points within 5 cm (%llu rows unknown), rows within "
 	       "%.2f ms (p99)\n",
-	       v->name, (unsigned long long)v->befallen, (unsigned long long)view.line.losses,
-	       (unsigned long long)view.sent.sent, (unsigned long long)view.profiles,
-	       (unsigned long long)view.lost_profiles, (long long)out, (unsigned long long)view.sent.corrupted,
-	       (unsigned long long)view.sent.dropped, 100.0 * (double)points.near / (double)points.points,
-	       (unsigned long long)points.points, (unsigned long long)points.unknown_rows,
-	       (double)points.time_p99_ns / 1e6);
+	       v->befallen ? "note: " : "", v->name, (unsigned long long)v->befallen,
+	       (unsigned long long)view.line.losses, (unsigned long long)view.sent.sent,
+	       (unsigned long long)view.profiles, (unsigned long long)view.lost_profiles, (long long)out,
+	       (unsigned long long)view.sent.corrupted, (unsigned long long)view.sent.dropped,
+	       100.0 * (double)points.near / (double)points.points, (unsigned long long)points.points,
+	       (unsigned long long)points.unknown_rows, (double)points.time_p99_ns / 1e6);
 	if (view.state != SUPERVISOR_STREAMING)
 		fail_msg("%s does not stream: %s", v->name, view.line.error);
 	assert_true(rig_now(rig) - view.last_data_ns < SECOND);

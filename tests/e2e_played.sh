@@ -10,23 +10,36 @@ out=$(mktemp -d)
 trap 'rm -rf "$out"' EXIT
 export build out
 
-# shellcheck disable=SC2016
-timeout -k 5 240 "$build/facet" simulate "profiles:$tilt/kurt3d_scan0_profiles.csv" "$tilt/kurt3d_scan1_profiles.csv" \
-    "$tilt/kurt3d_scan2_profiles.csv" --speed max --dir "$out/d" -- sh -eu -c '
-    "$build/facetd" --journal "$out/journal" 2>"$out/log" &
-    daemon=$!
-    until [ -S "$out/d/facetd.sock" ]; do kill -0 $daemon; sleep 0.1; done
-    "$build/facet" save --wait-steps 678 --timeout 200 -o "$out/live.ply"
-    kill $daemon
-    wait $daemon
-' >"$out/simulate.log" 2>&1 || { cat "$out/simulate.log" "$out/log"; exit 1; }
+play() {
+    rm -rf "$out/d" "$out/journal"
+    # shellcheck disable=SC2016
+    timeout -k 5 240 "$build/facet" simulate "profiles:$tilt/kurt3d_scan0_profiles.csv" "$tilt/kurt3d_scan1_profiles.csv" \
+        "$tilt/kurt3d_scan2_profiles.csv" --speed max --dir "$out/d" -- sh -eu -c '
+        "$build/facetd" --journal "$out/journal" 2>"$out/log" &
+        daemon=$!
+        until [ -S "$out/d/facetd.sock" ]; do kill -0 $daemon; sleep 0.1; done
+        "$build/facet" save --wait-steps 678 --timeout 200 -o "$out/live.ply"
+        kill $daemon
+        wait $daemon
+    ' >"$out/simulate.log" 2>&1 || { cat "$out/simulate.log" "$out/log"; exit 1; }
+}
+
+# Where nothing comes for a second, rows wait for their look-ahead no longer: a machine that stalls so long gives another
+# map, by the rules. Then it is played again.
+tries=0
+until [ $tries -eq 3 ]; do
+    tries=$((tries + 1))
+    play
+    first=$("$build/tests/steps" "$out/d/facetd.yaml" "$out/journal" "$out/first.ply")
+    case $first in *" 0 pauses") break ;; esac
+    echo "note: the machine stalled for seconds: played again ($first)"
+done
 
 # Kept and fed again, meshed in other portions: the same mesh.
-first=$("$build/tests/steps" "$out/d/facetd.yaml" "$out/journal" "$out/first.ply")
 second=$("$build/tests/steps" "$out/d/facetd.yaml" "$out/journal" "$out/second.ply")
 echo "note: $first"
 [ "$first" = "$second" ]
-[ "${first#* }" = "678 profiles 678 steps" ] || { echo "not every line became one row: $first"; exit 1; }
+[ "${first#* }" = "678 profiles 678 steps 0 pauses" ] || { echo "not every line became one row in time: $first"; exit 1; }
 cmp "$out/live.ply" "$out/first.ply"
 cmp "$out/first.ply" "$out/second.ply"
 

@@ -18,6 +18,8 @@ struct steps {
 	struct patch_store *store;
 	const char *dir;
 	char **wanted; /* ends with NULL */
+	bool idle;     /* the look-ahead was folded after a second without a row, and no row came since */
+	int pauses;    /* such seconds between rows */
 };
 
 static void mesh(struct steps *s)
@@ -65,6 +67,8 @@ static void stepped(struct steps *s)
 static bool take_row(void *ctx, struct row *row)
 {
 	struct steps *s = ctx;
+	s->pauses += s->idle;
+	s->idle = false;
 	map_row(s->map, row);
 	stepped(s);
 	return true;
@@ -73,6 +77,7 @@ static bool take_row(void *ctx, struct row *row)
 static void flush(void *ctx)
 {
 	struct steps *s = ctx;
+	s->idle = true;
 	map_flush(s->map);
 	stepped(s);
 }
@@ -121,8 +126,8 @@ int main(int argc, char **argv)
 	patch_store_hash(s.store, hash);
 	struct pipeline_stats stats;
 	pipeline_stats(p, &stats);
-	printf("%s %llu profiles %llu steps\n", hash, (unsigned long long)stats.sweep.profiles,
-	       (unsigned long long)map_step(s.map));
+	printf("%s %llu profiles %llu steps %d pauses\n", hash, (unsigned long long)stats.sweep.profiles,
+	       (unsigned long long)map_step(s.map), s.pauses);
 	pipeline_destroy(p);
 	return 0;
 }

@@ -30,6 +30,7 @@
 #define WIRE_BYTES    (256 << 10) /* more waits in the device */
 #define PIECES        8192
 #define TRUTHS        160 /* profiles remembered: a second and more at 75 Hz and 2 turns */
+#define KNOWN_NS      (2 * RIG_SECOND)
 #define TIMES         4096
 #define CONTIGUOUS_NS (20 * RIG_MS)
 #define DUMMY_FD      1000
@@ -67,7 +68,8 @@ struct truth {
 struct piece {
 	int64_t left_ns, arrival_ns;
 	size_t len, read;
-	int profiles; /* telegrams with a profile whose last byte is in it */
+	int ends;     /* of telegrams with a profile */
+	int profiles; /* those of them that left right */
 };
 
 /* The way from a device to the host, and the link at its end. */
@@ -93,7 +95,7 @@ struct link {
 	int64_t last_arrival_ns;
 	int64_t torn_ns; /* the beginning of the telegram that leaves now was lost then; -1: it was not */
 	int64_t cut_ns;  /* likewise of the one that is read now */
-	uint64_t sent_seen;
+	uint64_t sent_seen, ends_seen;
 	/* for the view */
 	uint64_t lost_profiles;
 	int64_t first_request_ns;
@@ -299,7 +301,7 @@ static const struct truth *recognise(const struct scanner *s, const struct row *
 		const struct truth *truth = &s->truth[i];
 		int64_t off_ns = row->t_ns - begin_of(truth, row);
 
-		if (llabs(off_ns) > RIG_SECOND || (found && llabs(off_ns) >= llabs(*ret_off_ns)))
+		if (llabs(off_ns) > KNOWN_NS || (found && llabs(off_ns) >= llabs(*ret_off_ns)))
 			continue;
 		if (!same_ranges(truth, row))
 			continue;
@@ -419,7 +421,7 @@ static void lose_pieces(struct link *l, unsigned n)
 		size_t left = piece->len - piece->read;
 
 		l->lost_profiles += (uint64_t)piece->profiles;
-		l->cut_ns = piece->profiles > 0 ? -1 : piece->left_ns;
+		l->cut_ns = piece->ends > 0 ? -1 : piece->left_ns;
 		l->begin = (l->begin + left) % WIRE_BYTES;
 		l->len -= left;
 		forget_piece(l);
@@ -441,24 +443,24 @@ static int64_t draw_arrival(struct link *l)
 	return l->last_arrival_ns = arrival_ns;
 }
 
-static void carry(struct link *l, const uint8_t *bytes, size_t n, int profiles)
+static void carry(struct link *l, const uint8_t *bytes, size_t n, int ends, int profiles)
 {
 	int64_t now_ns = l->rig->now_ns;
 	bool rest = is_rest(l->torn_ns, now_ns);
 
 	if (l->state != OPEN || l->dumb) {
 		l->lost_profiles += (uint64_t)profiles;
-		l->torn_ns = profiles > 0 ? -1 : now_ns;
+		l->torn_ns = ends > 0 ? -1 : now_ns;
 		return;
 	}
-	l->torn_ns = rest && profiles == 0 ? now_ns : -1;
-	if (rest && profiles > 0) {
+	l->torn_ns = rest && ends == 0 ? now_ns : -1;
+	if (rest && ends > 0 && profiles == ends) {
 		l->lost_profiles++;
 		profiles--;
 	}
 	copy_in(l, bytes, n);
-	*piece_at(l, l->pieces++) =
-	    (struct piece){.left_ns = now_ns, .arrival_ns = draw_arrival(l), .len = n, .profiles = profiles};
+	*piece_at(l, l->pieces++) = (struct piece){
+	    .left_ns = now_ns, .arrival_ns = draw_arrival(l), .len = n, .ends = ends, .profiles = profiles};
 }
 
 /* What has left the device goes onto the wire. */
@@ -473,8 +475,10 @@ static void drain(struct link *l)
 		if (n == 0)
 			return;
 		l->brain.counts(l->brain.ctx, &counts);
-		carry(l, bytes, n, (int)(counts.sent - l->sent_seen));
+		carry(l, bytes, n, (int)(counts.sent + counts.corrupted - l->ends_seen),
+		      (int)(counts.sent - l->sent_seen));
 		l->sent_seen = counts.sent;
+		l->ends_seen = counts.sent + counts.corrupted;
 	}
 }
 
@@ -587,8 +591,8 @@ static ssize_t link_read(struct link *l, uint8_t *buf, size_t cap, int64_t *t_ns
 		if (piece->read == piece->len) {
 			bool rest = is_rest(l->cut_ns, piece->left_ns);
 
-			l->lost_profiles += rest && piece->profiles > 0;
-			l->cut_ns = rest && piece->profiles == 0 ? piece->left_ns : -1;
+			l->lost_profiles += rest && piece->ends > 0 && piece->profiles == piece->ends;
+			l->cut_ns = rest && piece->ends == 0 ? piece->left_ns : -1;
 			forget_piece(l);
 		}
 	}

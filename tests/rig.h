@@ -104,7 +104,7 @@ int rig_log_count(const struct rig *, const char *device, size_t from, const cha
 
 /* Rows against the truth. A row is recognised by its ranges, whatever its time. */
 struct rig_points {
-	uint64_t rows, unknown_rows; /* of no profile that this scanner measured within the last second */
+	uint64_t rows, unknown_rows; /* of no profile that this scanner measured within two seconds */
 	uint64_t points, near;       /* within RIG_NEAR_M of where the beam truly ended */
 	double worst_m;
 	int64_t time_p50_ns, time_p99_ns, time_worst_ns; /* of rows: |time said - time true|, over the newest 4096 */

@@ -113,7 +113,7 @@ static void init(struct decoder *d)
 	d->model = MODELS;
 	d->frequency_chz = 0;
 	d->seen = false;
-	d->telegram_counter = 0;
+	d->telegram_counter = d->scan_counter = 0;
 	d->t_startup_us = d->t_transmit_us = 0;
 	d->scans = (struct scan_count){0};
 	memset(d->count, 0, sizeof(d->count));

@@ -38,7 +38,8 @@ struct line {
 	struct supervisor_device status;
 	int64_t deadline_ns, backoff_ns;
 	int64_t blocked_ns; /* since when bytes wait to be taken */
-	bool taken;         /* a byte was, since it was opened */
+	int64_t opened_ns;
+	bool taken; /* a byte was, since it was opened */
 	/* What it may still send, and when that was reckoned; reading waits until then while `paused`. */
 	int64_t budget_bytes, budget_ns, resume_ns;
 	bool paused;
@@ -160,9 +161,14 @@ static void lose(struct supervisor *s, struct line *line, const char *why, int64
 		close_line(s, line, SUPERVISOR_CLOSED, t_ns);
 		return;
 	}
+	const bool hung = line->unwritten_len > 0 && !line->taken;
+
 	leave(s, line, why, "trying again", t_ns);
 	close_line(s, line, SUPERVISOR_BACKING_OFF, t_ns);
-	line->deadline_ns = t_ns + line->backoff_ns;
+	/* An opening that hung has waited already. */
+	line->deadline_ns = (hung ? line->opened_ns : t_ns) + line->backoff_ns;
+	if (line->deadline_ns < t_ns)
+		line->deadline_ns = t_ns;
 	line->backoff_ns *= 2;
 	if (line->backoff_ns > SUPERVISOR_BACKOFF_MAX_NS)
 		line->backoff_ns = SUPERVISOR_BACKOFF_MAX_NS;
@@ -317,6 +323,7 @@ static void open_line(struct supervisor *s, struct line *line, int64_t t_ns)
 
 	line->status.opens++;
 	line->deadline_ns = INT64_MAX;
+	line->opened_ns = t_ns;
 	line->taken = false;
 	line->noise_bytes = 0;
 	if (line->driver->link_open) {

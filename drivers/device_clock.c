@@ -374,15 +374,16 @@ static bool delay_sane(int64_t delay_ns)
 
 static bool points_sane(const struct device_clock *c)
 {
+	if (c->points < 1)
+		return false;
 	const struct device_clock_point *first = &c->point[0], *last = &c->point[c->points - 1];
 
 	for (int i = 0; i < c->points; i++)
 		if (!ticks_sane(c, c->point[i].ticks) || !delay_sane(c->point[i].delay_ns) ||
 		    (i > 0 && c->point[i].ticks <= c->point[i - 1].ticks))
 			return false;
-	return c->points > 0 && last->ticks <= c->ticks &&
-	       ticks_to_ns(c, c->ticks - first->ticks) <= 2 * window_ns(c) && c->touches.ticks >= first->ticks &&
-	       c->touches.ticks <= last->ticks && delay_sane(c->touches.delay_ns);
+	return last->ticks <= c->ticks && ticks_to_ns(c, c->ticks - first->ticks) <= 2 * window_ns(c) &&
+	       c->touches.ticks >= first->ticks && c->touches.ticks <= last->ticks && delay_sane(c->touches.delay_ns);
 }
 
 static bool doubt_sane(const struct device_clock *c)

@@ -584,6 +584,7 @@ static void an_opening_that_hangs_is_given_up_after_a_second_and_a_half(void **s
 	supervisor_timer(supervisor, SUPERVISOR_OPEN_NS);
 	expect_state(0, SUPERVISOR_BACKING_OFF);
 	assert_non_null(strstr(supervisor_device(supervisor, 0)->error, "switched on"));
+	assert_int_equal(supervisor_deadline(supervisor), SUPERVISOR_OPEN_NS); /* it has waited enough */
 	end();
 }
 

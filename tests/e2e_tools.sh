@@ -94,6 +94,26 @@ assert devices["laser"]["note"] == "" and devices["laser"]["silent"] >= 0, devic
 timeout 20 "$facet" watch "$address" | head -n 2 >"$scratch/lines"
 [ "$(grep -c '^step [0-9]' "$scratch/lines")" -eq 2 ] || fail "facet watch in a pipe: $(cat "$scratch/lines")"
 
+# In a window of 80 columns and 24 rows nothing is cut off: lines are folded, the columns of the table fit.
+python3 - "$facet" "$address" >"$scratch/window" <<'EOF' || fail "facet watch in a window of 80 columns: $(cat "$scratch/window")"
+import fcntl, os, pty, re, signal, struct, sys, termios, time
+
+pid, fd = pty.fork()
+if pid == 0:
+    fcntl.ioctl(0, termios.TIOCSWINSZ, struct.pack("4H", 24, 80, 0, 0))
+    os.execv(sys.argv[1], [sys.argv[1], "watch", sys.argv[2]])
+seen, end = b"", time.monotonic() + 30
+while seen.count(b"\033[J") < 2 and time.monotonic() < end:
+    seen += os.read(fd, 65536)
+os.kill(pid, signal.SIGINT)
+lines = [re.sub(r"\033\[[?0-9]*[A-Za-z]", "", line) for line in seen.split(b"\033[H")[1].decode().splitlines()]
+print("\n".join(lines))
+assert max(map(len, lines)) < 80, "wider than the window"
+assert re.fullmatch(r"servo .* [0-9,]+", next(line for line in lines if line.startswith("servo")))
+assert "until its changes can be sent" in re.sub(r"\s+", " ", " ".join(lines)), "cut off"
+assert re.search(r" up \d+:\d\d:\d\d", " ".join(lines[:2])), "cut off"
+EOF
+
 # A pose that nobody feeds is open, but nothing streams.
 cat >"$scratch/lone.yaml" <<YAML
 devices:
@@ -188,7 +208,7 @@ watch=$!
 until_true 20 grep -q '^step' "$scratch/lines" || fail "nothing is watched"
 kill "$daemon"
 wait "$daemon" 2>/dev/null
-until_true 20 grep -q 'facet: ' "$scratch/err" || fail "the loss is not said"
+until_true 20 grep -q 'facet: .*; trying again every second' "$scratch/err" || fail "the loss is not said: $(cat "$scratch/err")"
 rm -rf "$scratch/run"
 mkdir "$scratch/run"
 : >"$scratch/lines"

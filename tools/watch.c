@@ -23,6 +23,7 @@
 #define ANSWER_MS  2000
 #define CONNECT_MS 2000
 #define COLUMNS    100 /* where nobody knows */
+#define FOLD       4   /* the indentation of what did not fit into a line */
 #define OTHERS_MAX 100 /* lines that may stand before an answer */
 
 enum { OPTION_ONCE = 256, OPTION_JSON };
@@ -160,7 +161,7 @@ static void put_device(FILE *out, json_t *device)
 		         number(device, "timing.jitter_ms.p99"));
 	if (member(device, "timing.drift_ppm"))
 		snprintf(lost, sizeof(lost), "%s", grouped(number(device, "timing.lost")));
-	fprintf(out, "%-11.31s %-7.12s %-11.16s %13s %16s %6s %9s\n", string(device, "name"), string(device, "driver"),
+	fprintf(out, "%-11.31s %-6.12s %-11.16s %14s %16s %6s %9s\n", string(device, "name"), string(device, "driver"),
 	        state_of(device), rate, jitter, lost, grouped(number(device, "records")));
 	put_complaints(out, device);
 	put_details(out, device);
@@ -170,7 +171,7 @@ static void put_devices(FILE *out, json_t *status)
 {
 	size_t i;
 	json_t *device;
-	fprintf(out, "%-11s %-7s %-11s %13s %16s %6s %9s\n", "DEVICE", "DRIVER", "STATE", "RATE Hz", "JITTER ms p50/99",
+	fprintf(out, "%-11s %-6s %-11s %14s %16s %6s %9s\n", "DEVICE", "DRIVER", "STATE", "RATE Hz", "JITTER ms p50/99",
 	        "LOST", "RECORDS");
 	json_array_foreach(member(status, "devices"), i, device) put_device(out, device);
 }
@@ -266,18 +267,39 @@ static void terminal_size(int *ret_columns, int *ret_rows)
 	*ret_rows = known ? size.ws_row : 24;
 }
 
-/* Draws over what is there, line by line, cut at the edges of the window; bytes that could steer it are left out. */
+/* How much of a line fits: what is longer goes on in the next one, from a blank on where there is one. */
+static int fitting(const char *text, int len, int width)
+{
+	if (len <= width)
+		return len;
+	for (int i = width; i > width / 2; i--)
+		if (text[i] == ' ')
+			return i;
+	return width;
+}
+
+/* Bytes that could steer the terminal are left out. The edge itself stays free: not every terminal clears behind it. */
+static void terminal_line(const char *text, int len, int indent)
+{
+	fprintf(stdout, "%*s", indent, "");
+	for (int i = 0; i < len; i++)
+		fputc((unsigned char)text[i] < ' ' || text[i] == 127 ? '?' : text[i], stdout);
+	fputs("\033[K\n", stdout);
+}
+
+/* Draws over what is there, folded at the right edge and cut at the lower one. */
 static void terminal_draw(const char *text)
 {
-	int columns, rows;
+	int columns, rows, indent = 0;
 	terminal_size(&columns, &rows);
 	fputs("\033[H", stdout);
 	for (int row = 1; *text && row < rows; row++) {
-		const int n = (int)strcspn(text, "\n");
-		for (int i = 0; i < n && i < columns - 1; i++)
-			fputc((unsigned char)text[i] < ' ' || text[i] == 127 ? '?' : text[i], stdout);
-		fputs("\033[K\n", stdout);
-		text += n + (text[n] == '\n');
+		const int len = (int)strcspn(text, "\n");
+		const int n = fitting(text, len, columns - 1 > indent ? columns - 1 - indent : 1);
+		terminal_line(text, n, indent);
+		indent = n < len && columns > 4 * FOLD ? FOLD : 0;
+		text += n;
+		text += n < len ? *text == ' ' : *text == '\n';
 	}
 	fputs("\033[J", stdout);
 	fflush(stdout);
@@ -327,7 +349,7 @@ static void show_loss(struct watch *watch, const char *why)
 		         why[first] ? why + first + 2 : "");
 		terminal_draw(text);
 	} else {
-		fprintf(stderr, "facet: %s\n", why);
+		fprintf(stderr, "facet: %s%s\n", why, watch->once ? "" : "; trying again every second");
 	}
 }
 

@@ -237,5 +237,6 @@ const struct driver driver_modbus = {
     .link_fd = modbus_bus_fd,
     .link_read = modbus_bus_read,
     .link_write = modbus_bus_write,
+    .link_error = modbus_bus_error,
     .link_close = modbus_bus_close,
 };

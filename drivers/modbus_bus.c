@@ -41,6 +41,8 @@
 
 struct link {
 	int fd;
+	char connect[CONFIG_TEXT_MAX];
+	int unit;
 	bool offset_known;
 	int64_t offset_ns; /* the loop's clock minus CLOCK_MONOTONIC */
 };
@@ -389,8 +391,12 @@ static bool address_is_good(const struct config_device *device, char error[160])
 	}
 	if (access(device->connect, R_OK | W_OK) == 0)
 		return true;
-	snprintf(error, 160, "%.80s: %s%s", device->connect, strerror(errno),
-	         errno == EACCES ? "; is the user in the group dialout?" : "");
+	if (errno == ENOENT)
+		snprintf(error, 160, "%.80s: there is no such device; plug it in, or correct `connect`",
+		         device->connect);
+	else
+		snprintf(error, 160, "%.80s: %s%s", device->connect, strerror(errno),
+		         errno == EACCES ? "; is the user in the group dialout?" : "");
 	return false;
 }
 
@@ -410,6 +416,8 @@ struct link *modbus_bus_open(const struct config_device *device, char error[160]
 		goto fail;
 	}
 	link->fd = pair[0];
+	snprintf(link->connect, sizeof link->connect, "%s", device->connect);
+	link->unit = device->slave;
 	bus->fd = pair[1];
 	bus->device = *device;
 	bus->serial = is_serial(device->connect);
@@ -485,6 +493,57 @@ ssize_t modbus_bus_write(struct link *link, const uint8_t *bytes, size_t len)
 	if (n < 0)
 		return errno == EAGAIN || errno == EINTR ? 0 : -errno;
 	return n;
+}
+
+static void tell_serial(const struct link *link, int error, char ret[160])
+{
+	const char *line = link->connect;
+
+	if (error == ETIMEDOUT)
+		snprintf(ret, 160, "%.50s: unit %d does not answer: check power, cable, `baud`, `parity` and `unit`",
+		         line, link->unit);
+	else if (error == EPROTO)
+		snprintf(ret, 160, "%.50s: what comes is no answer of unit %d: check `baud`, `parity` and the cable",
+		         line, link->unit);
+	else if (error == EBUSY)
+		snprintf(ret, 160, "%.50s: another program uses this line; end that one, or correct `connect`", line);
+	else if (error == ENOTTY)
+		snprintf(ret, 160, "%.50s: this is no serial line; correct `connect`", line);
+	else
+		snprintf(ret, 160, "%.50s: the line failed (%s): is the adapter plugged in?", line, strerror(error));
+}
+
+/* libmodbus says of a name that nobody knows that it refused. */
+static void tell_tcp(const struct link *link, int error, char ret[160])
+{
+	const char *peer = link->connect;
+
+	if (error == ECONNREFUSED)
+		snprintf(ret, 160,
+		         "%.60s refuses the connection, or nobody knows the name: check address and port in `connect`",
+		         peer);
+	else if (error == EHOSTUNREACH || error == ENETUNREACH)
+		snprintf(ret, 160,
+		         "%.60s cannot be reached: check cable and power, and that this host is in its network", peer);
+	else if (error == ETIMEDOUT)
+		snprintf(ret, 160, "%.60s: unit %d does not answer: check cable, power, address and `unit`", peer,
+		         link->unit);
+	else if (error == ECONNRESET || error == EPIPE)
+		snprintf(ret, 160, "%.60s broke the connection off: it was restarted, or serves too many clients",
+		         peer);
+	else if (error == EPROTO)
+		snprintf(ret, 160, "%.60s: what comes is no answer of unit %d: is this the servo's address?", peer,
+		         link->unit);
+	else
+		snprintf(ret, 160, "the connection to %.60s failed (%s)", peer, strerror(error));
+}
+
+void modbus_bus_error(const struct link *link, int error, char ret[160])
+{
+	if (is_serial(link->connect))
+		tell_serial(link, error, ret);
+	else
+		tell_tcp(link, error, ret);
 }
 
 void modbus_bus_close(struct link *link)

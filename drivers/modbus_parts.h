@@ -22,6 +22,7 @@ struct link *modbus_bus_open(const struct config_device *, char error[160]);
 int modbus_bus_fd(const struct link *);
 ssize_t modbus_bus_read(struct link *, uint8_t *buf, size_t cap, int64_t *t_ns);
 ssize_t modbus_bus_write(struct link *, const uint8_t *bytes, size_t len);
+void modbus_bus_error(const struct link *, int error, char ret[160]);
 void modbus_bus_close(struct link *);
 
 /* The dialogue of modbus_dialogue.c. */

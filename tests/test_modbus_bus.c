@@ -214,7 +214,7 @@ static void a_lost_bus_is_reported_and_can_be_opened_again(void **state)
 		driver_modbus.link_close(link);
 	}
 	assert_null(driver_modbus.link_open(&config.device[0], error));
-	assert_non_null(strstr(error, "No such file"));
+	assert_non_null(strstr(error, "plug it in, or correct `connect`"));
 }
 
 static void a_host_that_refuses_costs_the_loop_nothing(void **state)
@@ -233,6 +233,9 @@ static void a_host_that_refuses_costs_the_loop_nothing(void **state)
 	link = driver_modbus.link_open(&config.device[0], error);
 	assert_non_null(link);
 	assert_true(until_lost(link) == -ECONNREFUSED);
+	driver_modbus.link_error(link, ECONNREFUSED, error);
+	assert_non_null(strstr(error, config.device[0].connect));
+	assert_non_null(strstr(error, "check address and port"));
 	driver_modbus.link_close(link);
 	close(fd);
 }

@@ -53,7 +53,7 @@ enum fault {
 	ALL_FAULTS
 };
 static const char *const fault_names[ALL_FAULTS] = {"unplug",    "refuse",     "hang",        "reset",
-                                                    "half open", "bytewise",   "hold",        "slow writes",
+                                                    "half-open", "bytewise",   "hold",        "slow writes",
                                                     "no baud",   "wall clock", "late angles", "no angles"};
 
 /* What a scanner measured: where each beam ended. */

@@ -28,7 +28,7 @@ enum rig_transport { RIG_SERIAL, RIG_TCP, RIG_USB };
  *   "refuse"       TCP: lost, and connections are refused
  *   "hang"         TCP: lost, and connections neither stand nor fail until it is over
  *   "reset"        TCP, USB: lost, once
- *   "half open"    no byte passes in either direction, and nobody is told, until the link is closed
+ *   "half-open"    no byte passes in either direction, and nobody is told, until the link is closed
  *   "bytewise"     a read delivers a byte
  *   "hold"         bytes wait for so many ms (value, default 100) and are read as one
  *   "slow writes"  a write takes a byte, the next one 1 ms later

@@ -60,7 +60,7 @@ struct misfortune {
 	    {"counter wrap", 7, 0, 0}, {"clock step", 10, 0, 0}, {"name blanks", 0, 500, 3000},              \
 	    {"time", 0, 500, 3000}, {"reset", 0, 0, 0},                                                      \
 	{                                                                                                    \
-		"half open", 0, 0, 0                                                                         \
+		"half-open", 0, 0, 0                                                                         \
 	}
 #define OF_TCP                       \
 	{"refuse", 0, 100, 6000},    \

@@ -263,9 +263,9 @@ static void a_stream_that_breaks_is_found_within_five_scans(void **state)
 		const char *kind;
 		int64_t most_ms;
 	} broken[] = {
-	    {{SIM_TIM561, SIM_COLA_A, NULL, 15}, "half open", 360},
-	    {{SIM_LMS111, SIM_COLA_B, NULL, 50}, "half open", 280},
-	    {{SIM_LMS511, SIM_COLA_B, "every: 5", 5}, "half open", 1030},
+	    {{SIM_TIM561, SIM_COLA_A, NULL, 15}, "half-open", 360},
+	    {{SIM_LMS111, SIM_COLA_B, NULL, 50}, "half-open", 280},
+	    {{SIM_LMS511, SIM_COLA_B, "every: 5", 5}, "half-open", 1030},
 	    {{SIM_TIM571, SIM_COLA_B, NULL, 15}, "silence", 360},
 	    {{SIM_LMS111, SIM_COLA_A, NULL, 50}, "idle", 280},
 	};

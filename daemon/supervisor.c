@@ -146,7 +146,8 @@ static void leave(struct supervisor *s, struct line *line, const char *why, cons
 	line->status.note[0] = 0;
 	line->status.losses++;
 	snprintf(line->status.error, sizeof(line->status.error), "%s", why);
-	if (told || strcmp(line->logged, line->status.error) != 0) {
+	/* The end of a stream that nobody was told of is not told either, or each new figure in its sentence costs a line. */
+	if (told || (!streamed && strcmp(line->logged, line->status.error) != 0)) {
 		char text[220];
 
 		snprintf(text, sizeof(text), "%s: %s; %s", told ? "lost" : "not ready", line->status.error, next);

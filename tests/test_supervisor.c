@@ -30,6 +30,7 @@ struct dialogue {
 
 static struct world {
 	bool absent, dead_read, dead_write, full, endless, never_ends, asks_without_end, begins_anew;
+	int read_error;   /* errno that a read fails with, 0: none */
 	size_t at_once;   /* a read delivers so many of its first byte */
 	char pending[64]; /* what the device has to say */
 	char heard[64];   /* what it was told */
@@ -76,6 +77,8 @@ static ssize_t fake_read(struct link *link, uint8_t *buf, size_t cap, int64_t *t
 	(void)t_ns;
 	if (w->dead_read)
 		return -EIO;
+	if (w->read_error)
+		return -w->read_error;
 	if (w->at_once) {
 		assert_true(w->at_once <= cap);
 		memset(buf, w->pending[0], w->at_once);
@@ -652,6 +655,30 @@ static void a_device_of_another_kind_is_lost_with_a_sentence_and_few_lines(void 
 	end();
 }
 
+/* Sentences with a figure in them are never the same twice. */
+static void a_device_that_comes_and_goes_for_ever_new_reasons_costs_few_lines(void **state)
+{
+	int64_t t_ns = 0;
+
+	(void)state;
+	begin(&silent, NULL, NULL);
+	for (int i = 0; i < 60; i++) {
+		world[0].read_error = i % 2 ? EIO : ENXIO;
+		supervisor_ready(supervisor, 0, true, false, t_ns + SECOND);
+		t_ns = supervisor_deadline(supervisor);
+		supervisor_timer(supervisor, t_ns);
+		expect_state(0, SUPERVISOR_STREAMING);
+	}
+	assert_int_equal(logs, 6);
+	assert_string_equal(log_lines[5].text, "lost: reading failed (No such device or address); trying again");
+	world[0].absent = true;
+	supervisor_ready(supervisor, 0, true, false, t_ns);
+	supervisor_timer(supervisor, supervisor_deadline(supervisor));
+	assert_int_equal(logs, 7); /* another state is told */
+	assert_string_equal(log_lines[6].text, "not ready: /dev/fake0 is not there; plug it in; trying again");
+	end();
+}
+
 static void a_telegram_now_and_then_forgives_the_noise_between(void **state)
 {
 	(void)state;
@@ -710,6 +737,7 @@ int main(void)
 	    cmocka_unit_test(an_opening_that_hangs_is_given_up_after_a_second_and_a_half),
 	    cmocka_unit_test(a_device_at_full_rate_is_read_within_its_budget),
 	    cmocka_unit_test(a_device_of_another_kind_is_lost_with_a_sentence_and_few_lines),
+	    cmocka_unit_test(a_device_that_comes_and_goes_for_ever_new_reasons_costs_few_lines),
 	    cmocka_unit_test(a_telegram_now_and_then_forgives_the_noise_between),
 	    cmocka_unit_test(a_device_that_is_set_up_again_is_lost_and_back),
 	};

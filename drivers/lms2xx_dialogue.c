@@ -270,7 +270,7 @@ static void compare_config(struct dialogue *d, const struct reply *reply)
 	const bool differs = memcmp(was.bytes, d->config.bytes, was.len) != 0;
 	if (!differs)
 		d->writes = 0;
-	if (differs && d->writes++ >= WRITES_MAX)
+	if (differs && d->writes >= WRITES_MAX)
 		fail(d, "the scanner does not keep its new settings: remove `unit`, `mode` and `indices`");
 	else if (differs)
 		enter(d, STAGE_INSTALL, reply->t_ns);
@@ -363,6 +363,7 @@ static void advance(struct dialogue *d, const struct reply *reply)
 		compare_config(d, reply);
 		break;
 	case STAGE_INSTALL:
+		d->writes++;
 		enter(d, STAGE_WRITE, t_ns);
 		break;
 	case STAGE_WRITE:

@@ -793,6 +793,26 @@ static void a_scanner_that_forgets_its_settings_is_written_three_times_at_most(v
 	assert_int_equal(w->scanner.config_writes, 3);
 }
 
+/* What was never sent wears nothing. */
+static void a_scanner_that_refused_its_password_is_written_once_it_takes_it(void **state)
+{
+	struct world *w = *state;
+	w->config->device[0].indices = INDICES_ON;
+	w->scanner.config[LMS2XX_CONFIG_AVAILABILITY] = 0;
+	w->scanner.wrong_password = true;
+	begin(w);
+	for (int i = 0; i < 6; i++) {
+		run(w, w->now_ns + 30 * SECONDS, DIALOGUE_FAILED);
+		assert_non_null(strstr(w->step.error, "refuses the password"));
+		w->step = (struct dialogue_step){0};
+		w->scanner.requests = 0;
+		lose_line(w, SECONDS);
+	}
+	w->scanner.wrong_password = false;
+	must_stream(w, 60 * SECONDS);
+	assert_int_equal(w->scanner.config_writes, 1);
+}
+
 static void a_power_cycle_while_it_is_set_up_begins_anew(void **state)
 {
 	struct world *w = *state;
@@ -844,6 +864,7 @@ int main(void)
 	    RIGGED(a_rate_the_scanner_refuses_is_said_and_done_without),
 	    RIGGED(indices_are_switched_on_once_and_only_if_asked_for),
 	    RIGGED(a_scanner_that_forgets_its_settings_is_written_three_times_at_most),
+	    RIGGED(a_scanner_that_refused_its_password_is_written_once_it_takes_it),
 	    RIGGED(a_power_cycle_while_it_is_set_up_begins_anew),
 	};
 	return cmocka_run_group_tests(tests, NULL, NULL);

@@ -117,8 +117,8 @@ static const struct expected {
      .rssi_bytes = 2,
      .has_time = true,
      .sending_us = {6200, 7700},
-     .median_ms = {0.01, 0.28},
-     .highest_ms = {0.1, 0.86}},
+     .median_ms = {0.09, 0.11},
+     .highest_ms = {0.25, 0.28}},
 };
 enum { EXPECTED = sizeof(expected) / sizeof(expected[0]) };
 

@@ -68,7 +68,7 @@ struct truth {
 struct piece {
 	int64_t left_ns, arrival_ns;
 	size_t len, read;
-	int ends;     /* of telegrams with a profile */
+	int ends;     /* of telegrams with a profile, and of garbage */
 	int profiles; /* those of them that left right */
 };
 
@@ -475,10 +475,11 @@ static void drain(struct link *l)
 		if (n == 0)
 			return;
 		l->brain.counts(l->brain.ctx, &counts);
-		carry(l, bytes, n, (int)(counts.sent + counts.corrupted - l->ends_seen),
+		/* Garbage ends whatever was begun. */
+		carry(l, bytes, n, (int)(counts.sent + counts.corrupted + counts.garbage - l->ends_seen),
 		      (int)(counts.sent - l->sent_seen));
 		l->sent_seen = counts.sent;
-		l->ends_seen = counts.sent + counts.corrupted;
+		l->ends_seen = counts.sent + counts.corrupted + counts.garbage;
 	}
 }
 

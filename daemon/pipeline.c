@@ -78,7 +78,7 @@ static void on_tilt(void *ctx, int device, const struct tilt *tilt)
 	for (int i = 0; i < p->scanners; i++)
 		if (p->scanner[i].tilt_device == device)
 			sweep_tilt(p->scanner[i].sweep, tilt);
-	if (p->sink.data)
+	if (p->sink.data && p->device[device].driver->role != ROLE_LASER) /* an encoder's ticks came with a profile */
 		p->sink.data(p->sink.ctx, device, p->log_ns);
 }
 

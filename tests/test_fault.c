@@ -92,6 +92,25 @@ static void unknown_devices_and_kinds_are_named_with_what_there_is(void **state)
 	assert_string_equal(error, "'radar': no such device; there is laser, pose");
 }
 
+static void a_value_out_of_bounds_is_refused_by_them(void **state)
+{
+	static const char *const own[] = {"sfa", "lost", "scale", "drift", NULL};
+	static const char *const good[] = {"laser: sfa", "laser: sfa 26", "laser: lost 0.1", "laser: drift -200"};
+	static const char *const bad[] = {"laser: sfa 27", "laser: sfa -1", "laser: lost 2", "laser: scale -1"};
+	const struct fault_target target = {"laser", {own, NULL}};
+	char error[FAULT_ERROR_MAX] = "";
+	(void)state;
+	for (size_t i = 0; i < sizeof good / sizeof good[0]; i++) {
+		const struct sim_fault fault = parsed(good[i]);
+		assert_int_equal(fault_check(&fault, &target, 1, error), 0);
+	}
+	for (size_t i = 0; i < sizeof bad / sizeof bad[0]; i++) {
+		const struct sim_fault fault = parsed(bad[i]);
+		assert_int_equal(fault_check(&fault, &target, 1, error), -EINVAL);
+	}
+	assert_string_equal(error, "'scale -1': its value is 0.001 .. 1000");
+}
+
 static void check_next(struct fault_plan *plan, int64_t t_ns, const char *kind, bool on)
 {
 	struct sim_fault fault;
@@ -139,6 +158,7 @@ int main(void)
 	    cmocka_unit_test(what_needs_a_duration_has_one),
 	    cmocka_unit_test(malformed_sentences_are_refused_by_one_that_says_the_form),
 	    cmocka_unit_test(unknown_devices_and_kinds_are_named_with_what_there_is),
+	    cmocka_unit_test(a_value_out_of_bounds_is_refused_by_them),
 	    cmocka_unit_test(faults_begin_and_end_in_the_order_of_their_times),
 	    cmocka_unit_test(a_full_plan_says_so),
 	};

@@ -20,6 +20,21 @@ static const struct {
                  {"refuse", 1000000000}, {"timeout", 1000000000}, {"busy", 1000000000},    {"error", 1000000000},
                  {"split", INT64_MAX},   {"jitter", INT64_MAX},   {"wander", INT64_MAX},   {"drift", INT64_MAX}};
 
+/* What a value may be; kinds that are not here take any, or none. A value of 0 is one that was not given. */
+static const struct {
+	const char *kind;
+	double min, max;
+} bounds[] = {{"corrupt", 0, 1},       {"crc", 0, 1},
+              {"lost", 0, 1},          {"duplicate", 0, 1},
+              {"merge", 1, 100},       {"gap", 0, 10000},
+              {"jitter", 0, 10000},    {"late", 0, 10000},
+              {"wander", 0, 10},       {"drift", -100000, 100000},
+              {"sfa", 1, 26},          {"baud", 9600, 500000},
+              {"mode", 0, 15},         {"permanent baud", 9600, 500000},
+              {"encoders", 1, 3},      {"echoes", 1, 5},
+              {"scale", 0.001, 1000},  {"clock step", -4294, 4294},
+              {"clock wrap", 0, 4294}, {"counter wrap", 0, 65535}};
+
 static int refuse(char error[FAULT_ERROR_MAX], const char *text, const char *why)
 {
 	snprintf(error, FAULT_ERROR_MAX, "'%.200s': %s; write DEVICE: KIND [VALUE] [at TIME] [for TIME|ever]", text,
@@ -134,6 +149,19 @@ static bool list_kinds(const struct fault_target *target, const char *kind, char
 	return false;
 }
 
+static int check_value(const struct sim_fault *fault, char error[FAULT_ERROR_MAX])
+{
+	for (size_t i = 0; i < sizeof bounds / sizeof bounds[0]; i++) {
+		if (strcmp(bounds[i].kind, fault->kind) != 0 || fault->value == 0 ||
+		    (fault->value >= bounds[i].min && fault->value <= bounds[i].max))
+			continue;
+		snprintf(error, FAULT_ERROR_MAX, "'%s %g': its value is %g .. %g", fault->kind, fault->value,
+		         bounds[i].min, bounds[i].max);
+		return -EINVAL;
+	}
+	return 0;
+}
+
 int fault_check(const struct sim_fault *fault, const struct fault_target *target, int targets,
                 char error[FAULT_ERROR_MAX])
 {
@@ -142,7 +170,7 @@ int fault_check(const struct sim_fault *fault, const struct fault_target *target
 		if (strcmp(target[i].device, fault->device) != 0)
 			continue;
 		if (list_kinds(&target[i], fault->kind, known, sizeof known))
-			return 0;
+			return check_value(fault, error);
 		snprintf(error, FAULT_ERROR_MAX, "'%s': %s has no such fault; it has %s", fault->kind, fault->device,
 		         known);
 		return -EINVAL;

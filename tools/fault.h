@@ -20,7 +20,7 @@ struct fault_target {
 	const char *device;
 	const char *const *kinds[2]; /* the second may be NULL */
 };
-/* Does one of them know it? Else one sentence that lists what there is. */
+/* Does one of them know it, and is its value possible? Else one sentence that says what there is. */
 int fault_check(const struct sim_fault *, const struct fault_target *, int targets, char error[FAULT_ERROR_MAX]);
 
 struct fault_plan {

@@ -667,7 +667,7 @@ static bool device_fault(void *ctx, const struct sim_fault *fault, bool on, int6
 		if (on && fault->for_ns == 0)
 			set_power(sim, true);
 	} else if (i == DRIFT) {
-		set_drift(sim, on ? fault->value : 0);
+		set_drift(sim, !on ? 0 : fault->value != 0 ? fault->value : 200);
 	} else if (!on || !set(sim, (enum fault)i, fault->value)) {
 		sim_fault_set(&sim->fault[i - SIM_LINE_FAULTS], fault, on);
 	}

@@ -507,10 +507,12 @@ static void tell_serial(const struct link *link, int error, char ret[160])
 		         line, link->unit);
 	else if (error == EBUSY)
 		snprintf(ret, 160, "%.50s: another program uses this line; end that one, or correct `connect`", line);
+	else if (error == EIO || error == ECONNRESET)
+		snprintf(ret, 160, "%.50s: the line hung up: is the adapter plugged in?", line);
 	else if (error == ENOTTY)
 		snprintf(ret, 160, "%.50s: this is no serial line; correct `connect`", line);
 	else
-		snprintf(ret, 160, "%.50s: the line failed (%s): is the adapter plugged in?", line, strerror(error));
+		snprintf(ret, 160, "%.50s: the line failed (%s)", line, strerror(error));
 }
 
 /* libmodbus says of a name that nobody knows that it refused. */

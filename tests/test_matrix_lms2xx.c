@@ -56,6 +56,22 @@ static const struct matrix_bench bench = {
 
 #define SETS_UP "tries the rates until it answers, reads its set-up, writes what differs, starts it"
 
+/* Within the row's time the servo turned round. */
+static void went_both_ways(struct rig *rig, const struct matrix_row *row)
+{
+	const int64_t now_ns = rig_epoch_ns(rig) + rig_now(rig);
+	bool up = false, down = false;
+
+	for (int64_t back_ns = 0; back_ns < 5 * SECOND; back_ns += 100 * MS) {
+		const double moved = rig_tilt(rig, now_ns - back_ns) - rig_tilt(rig, now_ns - back_ns - 100 * MS);
+
+		up |= moved < 0;
+		down |= moved > 0;
+	}
+	if (!up || !down)
+		fail_msg("%s: the servo went one way only", row->name);
+}
+
 static const struct matrix_row rows[] = {
     {.name = "factory state (9600 Bd, 180/0.5)",
      .does = "finds 9600 Bd, changes to the configured rate, starts",
@@ -358,6 +374,11 @@ static const struct matrix_row rows[] = {
      .fault = {{"no angles", 0, 5 * SECOND}},
      .pause_ns = 100 * MS,
      .again_ns = 100 * MS},
+    {.name = "reversed sweep (the servo turns round)",
+     .does = "goes on; points of both ways lie where their beams ended",
+     .pause_ns = 100 * MS,
+     .again_ns = 100 * MS,
+     .check = went_both_ways},
 };
 
 int main(void)

@@ -10,7 +10,7 @@
  *     end of scan = clock(last byte - transfer),   first beam = end - (turns - 1) * 13.3 ms - fov * 37.04 us - latency.
  * A scan of 0.5 (0.25) degree is 2 (4) turns of the mirror interlaced, each measuring every second (fourth) beam in
  * this order: struct profile says so and every beam gets its time from there. What the scanner adds itself (it is not
- * published) is a constant for calibration, `latency`. The rate is learned from the request that sets it.
+ * published) is a constant for calibration, `latency`. The rate is learned from the request that sets it, and from status.
  *
  * Which clock: where real-time indices follow the values, the scan index counts every scan that the mirror made, also
  * those that a slow line skipped or lost, so the index is the time and a device clock follows it. Where they are off, and
@@ -317,6 +317,15 @@ static void take_scan(struct decoder *d, const uint8_t *payload, size_t len, con
 	sink->profile(sink->ctx, d->device, &d->profile);
 }
 
+static void take_baud(struct decoder *d, uint32_t baud)
+{
+	if (baud == 0 || baud == d->baud)
+		return;
+	d->baud = baud;
+	clocks_init(d);
+}
+
+/* The status says the rate, too: where the scanner stands at the wanted one already, or keeps its own, none is asked for. */
 static void learn_variant(struct decoder *d, const uint8_t *payload, size_t len)
 {
 	struct lms2xx_status status;
@@ -325,6 +334,7 @@ static void learn_variant(struct decoder *d, const uint8_t *payload, size_t len)
 	if (payload[0] == LMS2XX_STATUS_REPLY && lms2xx_decode_status(payload, len, &status)) {
 		d->fov_deg = status.fov_deg;
 		d->resolution_cdeg = status.resolution_cdeg;
+		take_baud(d, status.baud);
 	} else if (lms2xx_decode_variant(payload, len, &taken, &fov_deg, &resolution_cdeg) && taken) {
 		d->fov_deg = fov_deg;
 		d->resolution_cdeg = resolution_cdeg;
@@ -333,11 +343,8 @@ static void learn_variant(struct decoder *d, const uint8_t *payload, size_t len)
 
 static void learn_baud(struct decoder *d, const uint8_t *payload)
 {
-	const uint32_t baud = lms2xx_mode_baud(d->asked_mode);
-	if (baud != 0 && payload[1] == 0 && baud != d->baud) {
-		d->baud = baud;
-		clocks_init(d);
-	}
+	if (payload[1] == 0)
+		take_baud(d, lms2xx_mode_baud(d->asked_mode));
 	d->asked_mode = 0;
 }
 

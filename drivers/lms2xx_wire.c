@@ -354,6 +354,23 @@ bool lms2xx_decode_config(const uint8_t *payload, size_t len, struct lms2xx_conf
 	return true;
 }
 
+/* The divisor of the scanner's clock. */
+static uint32_t word_baud(uint16_t word)
+{
+	switch (word) {
+	case 0x8067:
+		return 9600;
+	case 0x8033:
+		return 19200;
+	case 0x8019:
+		return 38400;
+	case 0x8001:
+		return 500000;
+	default:
+		return 0;
+	}
+}
+
 bool lms2xx_decode_status(const uint8_t *payload, size_t len, struct lms2xx_status *ret)
 {
 	enum { LONG = 1 + 152 + 1, SHORT = 1 + 146 + 1, SHIFT = 6 };
@@ -364,6 +381,7 @@ bool lms2xx_decode_status(const uint8_t *payload, size_t len, struct lms2xx_stat
 		const size_t shift = len == SHORT ? SHIFT : 0;
 		ret->fov_deg = get16(payload + 107 - shift);
 		ret->resolution_cdeg = get16(payload + 109 - shift);
+		ret->baud = word_baud(get16(payload + 116 - shift));
 	}
 	return true;
 }

@@ -136,6 +136,7 @@ struct lms2xx_status {
 	uint8_t mode;   /* operating mode, enum lms2xx_mode */
 	uint8_t device; /* 0: ok */
 	int fov_deg, resolution_cdeg;
+	uint32_t baud; /* at which it says this; 0: no rate that is known */
 };
 bool lms2xx_decode_status(const uint8_t *payload, size_t len, struct lms2xx_status *ret);
 

@@ -533,6 +533,32 @@ static void the_expected_rate_is_what_the_line_lets_through(void **state)
 	}
 }
 
+/* A scanner that stands at another rate than the configured one, and is left there, is never asked for a rate. */
+static void the_rate_is_also_learned_from_the_status(void **state)
+{
+	struct rig *rig = *state;
+	struct decoder_timing timing;
+	static const struct {
+		size_t len, at;
+		uint16_t word;
+		double hz; /* 361 values */
+	} said[] = {{154, 116, 0x8019, 37.5 / 8},
+	            {148, 110, 0x8067, 37.5 / 29},
+	            {154, 116, 0x8001, 37.5},
+	            {154, 116, 0x1234, 37.5},
+	            {150, 116, 0x8019, 37.5}};
+	for (size_t i = 0; i < sizeof said / sizeof said[0]; i++) {
+		uint8_t p[154] = {LMS2XX_STATUS_REPLY};
+		p[said[i].at] = (uint8_t)said[i].word;
+		p[said[i].at + 1] = (uint8_t)(said[i].word >> 8);
+		feed_payload(rig, p, said[i].len);
+		tell_mode(rig, 0x05);
+		feed_scan(rig, (struct lms2xx_scan){.n = 361, .unit = LMS2XX_MM, .status = 0x10});
+		driver_lms2xx.timing(rig->decoder, &timing);
+		assert_float_equal(timing.expected_hz, said[i].hz, 0.01);
+	}
+}
+
 static size_t save(struct rig *rig, uint8_t *ret, size_t cap)
 {
 	struct state s;
@@ -680,6 +706,7 @@ int main(void)
 	    RIGGED(partial_scans_are_dated_by_their_arrival_whatever_the_index),
 	    RIGGED(latency_moves_every_beam),
 	    RIGGED(the_expected_rate_is_what_the_line_lets_through),
+	    RIGGED(the_rate_is_also_learned_from_the_status),
 	    RIGGED(a_snapshot_anywhere_goes_on_the_same),
 	    RIGGED(a_broken_snapshot_leaves_the_decoder_as_new),
 	    RIGGED(what_the_device_says_of_itself_is_counted),

@@ -38,7 +38,8 @@ until_true() { # COMMAND...: tried five times a second for a minute
 start_devices() { # ARGUMENTS...
     "$build/facet" simulate hall --dir "$scratch/d" "$@" >>"$scratch/simulator.log" 2>&1 &
     simulator=$!
-    until_true [ -e "$scratch/d/servo" ] || give_up "the simulator does not come up"
+    until_true [ -e "$scratch/d/servo" ] && until_true [ -e "$scratch/d/facetd.yaml" ] ||
+        give_up "the simulator does not come up"
 }
 
 status() { # EXPRESSION over the status s and its devices d: its value

@@ -127,9 +127,9 @@ struct live {
 };
 
 /* `options`: of facet simulate, ending with NULL. */
-static pid_t start_simulation(const struct live *live, char **options)
+static pid_t start_simulation(const struct live *live, const char *const *options)
 {
-	char *argv[ARGUMENTS_MAX] = {"facet", "simulate", "building", "--endless", "--dir", (char *)live->dir};
+	const char *argv[ARGUMENTS_MAX] = {"facet", "simulate", "building", "--endless", "--dir", live->dir};
 	char facet[256], facetd[256];
 	int n = 6;
 	pid_t pid;
@@ -141,12 +141,12 @@ static pid_t start_simulation(const struct live *live, char **options)
 	argv[n++] = "--";
 	argv[n++] = facetd;
 	argv[n++] = "--journal";
-	argv[n++] = (char *)live->journal;
+	argv[n++] = live->journal;
 	assert_true(n < ARGUMENTS_MAX);
 	pid = fork();
 	if (pid == 0) {
 		prctl(PR_SET_PDEATHSIG, SIGTERM); /* a test that fails leaves nothing running */
-		execv(facet, argv);
+		execv(facet, (char **)(uintptr_t)argv);
 		_exit(127);
 	}
 	return pid;
@@ -169,7 +169,7 @@ static struct client *open_client(const char *address)
 	return client;
 }
 
-static void open_live(struct live *live, char **options)
+static void open_live(struct live *live, const char *const *options)
 {
 	char error[CLIENT_ERROR_MAX] = "";
 
@@ -331,7 +331,7 @@ static void live_maps_and_their_kept_lists_are_the_same_bytes_also_from_mid_sess
 	char second[70], last[70];
 	struct live live;
 	(void)state;
-	open_live(&live, (char *[]){NULL});
+	open_live(&live, (const char *const[]){NULL});
 	follow(&live, FIRST_MAP, 100);
 	command(&live, "?PAUSE");
 	for (int i = 0; i < 5; i++)
@@ -373,7 +373,7 @@ static struct state_of_map drive_twice(struct live *live)
 
 static void lists_with_faults_of_every_scanner_give_their_maps(void **state)
 {
-	static char *options[][ARGUMENTS_MAX] = {
+	static const char *const options[][ARGUMENTS_MAX] = {
 	    {"--laser", "lms2xx", "--fault", "laser: corrupt 0.3 at 2s for 2s", "--fault",
 	     "laser: unplug at 7s for 300ms", NULL},
 	    {"--laser", "tim", "--fault", "laser: corrupt 0.3 at 1s for 1s", "--fault", "laser: unplug at 3s for 300ms",

@@ -618,6 +618,9 @@ int reader_group(struct reader *r, enum key_group group, unsigned drivers, int m
 		return group == GROUP_SWEEP || group == GROUP_BOX || group == GROUP_ENCODER
 		           ? 0
 		           : check_required(r, group, drivers, map);
+	if (!r->path[0] && node_at(r, map)->kind == YAML_LIST)
+		return reader_fail(r, node_at(r, map)->line,
+		                   "configuration: a list does not stand alone; write `devices:` above the devices");
 	if (node_at(r, map)->kind != YAML_MAP)
 		return reader_fail(r, node_at(r, map)->line, "%s: `key: value` pairs are needed here",
 		                   r->path[0] ? r->path : "configuration");

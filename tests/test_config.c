@@ -155,6 +155,8 @@ static void an_unknown_key_names_its_line_and_the_nearest_key(void **state)
 {
 	(void)state;
 	assert_refused("map:\n  cel: 0.05\n", "f.yaml:2: unknown key 'cel' in map", "'cell'");
+	assert_refused("- {name: laser, driver: tim, connect: usb}\n",
+	               "f.yaml:1: configuration: ", "write `devices:` above");
 	assert_refused("\nmpa: {}\n", "f.yaml:2: unknown key 'mpa'", "'map'");
 	assert_refused("map: {tolerence: 1}\n", "f.yaml:1:", "'tolerance'");
 	assert_refused("devices:\n- name: a\n  driver: lms2xx\n  prot: x\n",

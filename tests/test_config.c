@@ -347,7 +347,7 @@ static void what_is_not_yaml_names_its_line(void **state)
 	assert_refused("{}\n---\n{}\n", "f.yaml:2:", "a second document");
 	assert_refused("map: &a {cell: 1}\nrobot: *a\n", "f.yaml:2: aliases", "write the value out");
 	assert_refused("just text", "f.yaml:1: configuration", "pairs");
-	assert_refused("[map]", "f.yaml:1: configuration", "pairs");
+	assert_refused("[map]", "f.yaml:1: configuration", "a list does not stand alone");
 	assert_refused("? [a]\n: b", "f.yaml:1:", "the name of a key");
 	assert_refused("map: {window: \"a\\0b\"}", "f.yaml:1:", "NUL");
 }

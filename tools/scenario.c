@@ -21,6 +21,7 @@
 #include "drivers/pose_line.h"
 #include "tools/output.h"
 #include "tools/sim_control.h"
+#include "tools/sim_gadget.h"
 
 #define POSE_MS  10
 #define UNIT     1    /* of the servo */
@@ -46,6 +47,7 @@ struct scenario {
 	struct sim_device laser; /* the shell's; to be asked what it did */
 	struct sim_pty *laser_pty;
 	struct sim_tcp *laser_tcp;
+	struct sim_gadget *laser_usb;
 	struct sim_control *control;
 	struct fault_target target[3];
 	bool mute; /* a fault: poses are not sent */
@@ -100,7 +102,7 @@ enum scenario_laser scenario_laser(const char *driver)
 static int print_laser(const struct scenario_params *params, int port, char *ret, size_t cap)
 {
 	const char *driver = lasers[params->laser].driver;
-	char encoder[80] = "";
+	char encoder[80] = "", connect[32] = "usb";
 
 	if (params->encoder) /* the servo's sense: up is positive */
 		snprintf(encoder, sizeof encoder, " encoder: {scale: %gdeg, sign: -1},", TICK_DEG);
@@ -109,9 +111,10 @@ static int print_laser(const struct scenario_params *params, int port, char *ret
 		                "  - {name: laser, driver: %s, port: \"%s/laser\", baud: 500000, variant: 180/0.5,\n"
 		                "     range: [0.3, %d], tilt: servo}\n",
 		                driver, params->dir, lasers[params->laser].range_m);
-	return snprintf(ret, cap,
-	                "  - {name: laser, driver: %s, connect: \"127.0.0.1:%d\",%s range: [0.3, %d], tilt: %s}\n",
-	                driver, port, encoder, lasers[params->laser].range_m, params->encoder ? "laser" : "servo");
+	if (!params->usb)
+		snprintf(connect, sizeof connect, "127.0.0.1:%d", port);
+	return snprintf(ret, cap, "  - {name: laser, driver: %s, connect: \"%s\",%s range: [0.3, %d], tilt: %s}\n",
+	                driver, connect, encoder, lasers[params->laser].range_m, params->encoder ? "laser" : "servo");
 }
 
 int scenario_yaml(const struct scenario_params *params, bool sweeps, int servo_port, int laser_port, char *ret,
@@ -204,7 +207,7 @@ static int create_brain(struct scenario *s)
 	const struct sim_lms2xx_params lms = {
 	    .fast = s->params.fast, .baud = LASER_BD, .mode = MODE_15, .millimetres = true};
 	const struct sim_cola_params cola = {.model = lasers[s->params.laser].model,
-	                                     .segments = true,
+	                                     .segments = !s->params.usb,
 	                                     .ticks_per_rad = 1.0 / (TICK_DEG * TRIG_DEG),
 	                                     .angle = s->params.encoder ? servo_angle : NULL,
 	                                     .ctx = s};
@@ -216,6 +219,10 @@ static int create_brain(struct scenario *s)
 
 static int start_laser(struct scenario *s, uv_loop_t *loop, char error[SCENARIO_ERROR_MAX])
 {
+	const struct sim_gadget_params usb = {
+	    .name = "facet",
+	    .serial = "1",
+	    .title = s->params.usb ? sim_cola_model_name(lasers[s->params.laser].model) : ""};
 	char link[128];
 
 	if (create_brain(s) < 0) {
@@ -225,9 +232,11 @@ static int start_laser(struct scenario *s, uv_loop_t *loop, char error[SCENARIO_
 	snprintf(link, sizeof link, "%.110s/laser", s->params.dir);
 	if (s->params.laser == SCENARIO_LMS2XX)
 		s->laser_pty = sim_pty_create(loop, link, &s->laser, error);
+	else if (s->params.usb)
+		s->laser_usb = sim_gadget_create(loop, &s->laser, &usb, error);
 	else
 		s->laser_tcp = sim_tcp_create(loop, 0, &s->laser, error);
-	return s->laser_pty || s->laser_tcp ? 0 : -EIO;
+	return s->laser_pty || s->laser_tcp || s->laser_usb ? 0 : -EIO;
 }
 
 static int start_devices(struct scenario *s, uv_loop_t *loop, char error[SCENARIO_ERROR_MAX])
@@ -260,6 +269,8 @@ static bool order(void *ctx, const struct sim_fault *fault, bool on)
 		return sim_servo_fault(s->servo, fault, on);
 	else if (s->laser_pty)
 		return sim_pty_fault(s->laser_pty, fault, on);
+	else if (s->laser_usb)
+		return sim_gadget_fault(s->laser_usb, fault, on);
 	else
 		return sim_tcp_fault(s->laser_tcp, fault, on);
 	return true;
@@ -286,8 +297,10 @@ static int start_control(struct scenario *s, uv_loop_t *loop, char error[SCENARI
 	    .socket = path, .target = s->target, .targets = 3, .ctx = s, .order = order, .status = print_status};
 	int r = 0;
 
-	s->target[0] = (struct fault_target){
-	    "laser", {s->laser.fault_kinds, s->laser_pty ? sim_pty_fault_kinds() : sim_tcp_fault_kinds()}};
+	const char *const *shell = s->laser_pty   ? sim_pty_fault_kinds()
+	                           : s->laser_usb ? sim_gadget_fault_kinds()
+	                                          : sim_tcp_fault_kinds();
+	s->target[0] = (struct fault_target){"laser", {s->laser.fault_kinds, shell}};
 	s->target[1] = (struct fault_target){"servo", {sim_servo_fault_kinds(), NULL}};
 	s->target[2] = (struct fault_target){"pose", {pose_kinds, NULL}};
 	snprintf(path, sizeof path, "%.110s/simulator.sock", s->params.dir);
@@ -396,6 +409,8 @@ void scenario_destroy(struct scenario *s)
 		sim_pty_destroy(s->laser_pty);
 	if (s->laser_tcp)
 		sim_tcp_destroy(s->laser_tcp);
+	if (s->laser_usb)
+		sim_gadget_destroy(s->laser_usb);
 	sim_servo_destroy(s->servo);
 	if (s->stage.destroy)
 		s->stage.destroy(s->stage.ctx);

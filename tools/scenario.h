@@ -48,6 +48,7 @@ struct scenario_params {
 	bool fast;       /* playback without the wire's pace */
 	bool tcp_servo;  /* the servo on TCP instead of a pseudo-terminal */
 	enum scenario_laser laser;
+	bool usb;           /* the scanner on USB: the TiM, as root on a kernel with gadgets */
 	bool encoder;       /* the angle comes in the scanner's telegrams (LMS1xx, LMS5xx) */
 	bool endless;       /* the drive goes there and back again until it is ended */
 	char *const *fault; /* sentences (fault.h) */

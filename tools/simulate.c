@@ -38,7 +38,7 @@ struct options {
 	int faults;
 	enum scenario_laser laser;
 	bool encoder, endless;
-	bool fast, tcp_servo;
+	bool fast, tcp_servo, usb;
 	double speed;
 	uint64_t seed;
 	char **command; /* NULL: none */
@@ -71,6 +71,7 @@ enum {
 	OPTION_SERVO,
 	OPTION_LASER,
 	OPTION_ENCODER,
+	OPTION_USB,
 	OPTION_ENDLESS
 };
 
@@ -83,6 +84,10 @@ static const struct argp_option option_list[] = {
     {"servo", OPTION_SERVO, "rtu|tcp", 0, "the servo on a pseudo-terminal (default) or on TCP", 0},
     {"laser", OPTION_LASER, "lms2xx|tim|lms1xx|lms5xx", 0,
      "which scanner: a LMS2xx on a pseudo-terminal (default), or a TiM571, LMS111, LMS511 on TCP", 0},
+    {"usb", OPTION_USB, 0, 0,
+     "the tim on USB instead of TCP: as root, on a kernel with a device controller (modprobe -a dummy_hcd libcomposite "
+     "usb_f_fs)",
+     0},
     {"encoder", OPTION_ENCODER, 0, 0, "the angle comes in the scanner's telegrams (lms1xx, lms5xx)", 0},
     {"endless", OPTION_ENDLESS, 0, 0, "the drive goes there and back again until it is ended", 0},
     {"fault", OPTION_FAULT, "SPEC", 0,
@@ -183,6 +188,9 @@ static error_t parse_option(int key, char *arg, struct argp_state *state)
 	case OPTION_LASER:
 		parse_laser(state, arg, o);
 		return 0;
+	case OPTION_USB:
+		o->usb = true;
+		return 0;
 	case OPTION_ENCODER:
 		o->encoder = true;
 		return 0;
@@ -242,6 +250,8 @@ static void check(const struct options *o)
 		refuse("recorded sweeps are played by a LMS2xx, which waits for its reader: --laser is for worlds");
 	if (!world && o->endless)
 		refuse("recorded sweeps end: --endless is for worlds");
+	if (o->usb && o->laser != SCENARIO_TIM)
+		refuse("--usb: only the TiM has a USB port: --laser tim");
 	if (o->encoder && o->laser != SCENARIO_LMS1XX && o->laser != SCENARIO_LMS5XX)
 		refuse("--encoder: only lms1xx and lms5xx have inputs for one");
 }
@@ -496,6 +506,7 @@ static int simulate(struct simulation *s, struct options *o)
 	                                 .tcp_servo = o->tcp_servo,
 	                                 .laser = o->laser,
 	                                 .encoder = o->encoder,
+	                                 .usb = o->usb,
 	                                 .endless = o->endless,
 	                                 .fault = o->fault,
 	                                 .faults = o->faults,

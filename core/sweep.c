@@ -278,7 +278,11 @@ static void walk_init(struct walk *w, const struct sweep *s, int64_t t_ns)
 	*w = (struct walk){.s = s, .tilt_next = ring_after(&s->tilt, t_ns), .pose_next = ring_after(&s->pose, t_ns)};
 	int64_t period_ns = tilt_period_ns(s);
 	w->tilt_limit_ns = period_ns + period_ns / 2;
-	w->tilt_gap_ns = s->params.hold_ns + w->tilt_limit_ns;
+	w->tilt_gap_ns = w->tilt_limit_ns; /* readers of files hold for ever */
+	if (s->params.hold_ns < INT64_MAX - w->tilt_limit_ns)
+		w->tilt_gap_ns += s->params.hold_ns;
+	else
+		w->tilt_gap_ns = INT64_MAX;
 	w->map_base = s->params.map_base;
 }
 

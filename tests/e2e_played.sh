@@ -11,7 +11,7 @@ trap 'rm -rf "$out"' EXIT
 export build out
 
 play() {
-    rm -rf "$out/d" "$out/journal"
+    rm -rf "$out/d" "$out/journal" "$out/live.ply"
     # shellcheck disable=SC2016
     timeout -k 5 240 "$build/facet" simulate "profiles:$tilt/kurt3d_scan0_profiles.csv" "$tilt/kurt3d_scan1_profiles.csv" \
         "$tilt/kurt3d_scan2_profiles.csv" --speed max --dir "$out/d" -- sh -eu -c '
@@ -22,6 +22,7 @@ play() {
         kill $daemon
         wait $daemon
     ' >"$out/simulate.log" 2>&1 || { cat "$out/simulate.log" "$out/log"; exit 1; }
+    [ -s "$out/live.ply" ] || { echo "no map by the end of the play:"; cat "$out/simulate.log" "$out/log"; exit 1; }
 }
 
 # Where nothing comes for a second, rows wait for their look-ahead no longer: a machine that stalls so long gives another

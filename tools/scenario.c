@@ -2,9 +2,9 @@
  * 100 Hz to DIR/pose.sock, and DIR/facetd.yaml, which reaches them all and lets the daemon listen on DIR/facetd.sock.
  * Faults are ordered at DIR/simulator.sock.
  *
- * A pose goes out with the time it is true for, in CLOCK_REALTIME, as any localisation would stamp it. The offset
- * between the two clocks is taken once, as the daemon does: a step of the wall clock moves neither. A datagram that
- * nobody takes (no daemon yet, its queue full) is not sent again: the next one is newer. */
+ * A pose goes out with the time it is true for, in CLOCK_REALTIME as it is then, as any localisation would stamp it: a
+ * wall clock that is set is followed. A datagram that nobody takes (no daemon yet, its queue full) is not sent again: the
+ * next one is newer. */
 #include "tools/scenario.h"
 
 #include <errno.h>
@@ -24,8 +24,9 @@
 #include "tools/sim_gadget.h"
 
 #define POSE_MS  10
-#define UNIT     1    /* of the servo */
-#define LASER_BD 9600 /* as from the factory */
+#define LOOK_NS  200000 /* two clocks that were read within so long belong together */
+#define UNIT     1      /* of the servo */
+#define LASER_BD 9600   /* as from the factory */
 #define MODE_15  0x05
 #define YAML_MAX 4096
 #define TICK_DEG 0.01 /* of the encoder in a scanner's telegrams */
@@ -54,7 +55,7 @@ struct scenario {
 	uv_timer_t *timer;
 	int pose_fd;
 	struct sockaddr_un pose_address;
-	int64_t realtime_ns; /* CLOCK_REALTIME - CLOCK_MONOTONIC */
+	int64_t realtime_ns; /* CLOCK_REALTIME - CLOCK_MONOTONIC, as it was seen last */
 	bool ended;
 };
 
@@ -166,12 +167,25 @@ static int write_yaml(const struct scenario *s, char error[SCENARIO_ERROR_MAX])
 
 /* ---- running ---- */
 
+/* False: the machine did something else between the two looks; what was seen before holds on. */
+static bool look_at_clocks(struct scenario *s)
+{
+	int64_t before_ns = clock_ns(CLOCK_MONOTONIC), wall_ns = clock_ns(CLOCK_REALTIME);
+	int64_t apart_ns = clock_ns(CLOCK_MONOTONIC) - before_ns;
+
+	if (apart_ns > LOOK_NS)
+		return false;
+	s->realtime_ns = wall_ns - before_ns - apart_ns / 2;
+	return true;
+}
+
 static void send_pose(struct scenario *s, int64_t now_ns)
 {
 	struct pose pose = s->stage.pose(s->stage.ctx, now_ns);
 	char line[POSE_LINE_MAX];
 	int n;
 
+	look_at_clocks(s);
 	pose.t_ns = now_ns + s->realtime_ns;
 	n = pose_line_print(&pose, line, sizeof line);
 	if (n > 0 &&
@@ -323,7 +337,8 @@ static int start_poses(struct scenario *s, uv_loop_t *loop, char error[SCENARIO_
 		snprintf(error, SCENARIO_ERROR_MAX, "no socket for the poses: %s", strerror(errno));
 		return -EIO;
 	}
-	s->realtime_ns = clock_ns(CLOCK_REALTIME) - clock_ns(CLOCK_MONOTONIC);
+	while (!look_at_clocks(s))
+		;
 	uv_timer_init(loop, s->timer);
 	s->timer->data = s;
 	uv_timer_start(s->timer, on_timer, 0, POSE_MS);

@@ -20,7 +20,6 @@
 #include <stdlib.h>
 #include <string.h>
 #include <sys/random.h>
-#include <time.h>
 #include <unistd.h>
 #include <uv.h>
 
@@ -31,11 +30,11 @@
 #include "daemon/publisher.h"
 #include "daemon/server.h"
 #include "daemon/supervisor.h"
+#include "daemon/wall_clock.h"
 #include "daemon/worker.h"
 
 #define TICK_MS       100
 #define STEP_NS       1000000 /* the wall clock was set if it is off by more */
-#define LOOK_NS       200000  /* clocks that were read within so long belong together */
 #define LAST_MS       2000
 #define LATENCIES     1024 /* the newest, for the percentiles */
 #define RATE_SECONDS  4    /* rates are means over so long */
@@ -86,29 +85,11 @@ struct daemon {
 	uint64_t seconds;
 };
 
-static int64_t clock_ns(clockid_t clock)
-{
-	struct timespec ts;
-
-	clock_gettime(clock, &ts);
-	return (int64_t)ts.tv_sec * 1000000000 + ts.tv_nsec;
-}
-
-/* realtime - monotonic. False: the machine did something else in between, look again later. */
-static bool clock_offset(int64_t *ret_ns)
-{
-	int64_t before_ns = clock_ns(CLOCK_MONOTONIC), wall_ns = clock_ns(CLOCK_REALTIME);
-	int64_t after_ns = clock_ns(CLOCK_MONOTONIC);
-
-	*ret_ns = wall_ns - before_ns - (after_ns - before_ns) / 2;
-	return after_ns - before_ns <= LOOK_NS;
-}
-
 static int64_t now(void *ctx)
 {
 	const struct daemon *d = ctx;
 
-	return clock_ns(CLOCK_MONOTONIC) + d->clock_offset_ns;
+	return wall_clock_read(CLOCK_MONOTONIC) + d->clock_offset_ns;
 }
 
 static void stop(struct daemon *d);
@@ -195,7 +176,7 @@ static void look_for_step(struct daemon *d)
 	struct buffer message = {0};
 	int64_t offset_ns, step_ns;
 
-	if (!clock_offset(&offset_ns))
+	if (!wall_clock_offset(&offset_ns))
 		return;
 	step_ns = offset_ns - d->wall_offset_ns;
 	if (step_ns >= -STEP_NS && step_ns <= STEP_NS)
@@ -684,9 +665,7 @@ int daemon_run(const struct config *config, const struct daemon_options *options
 	signal(SIGPIPE, SIG_IGN);
 	d->config = config;
 	d->error = error;
-	for (int i = 0; i < 100 && !clock_offset(&d->clock_offset_ns); i++)
-		;
-	d->wall_offset_ns = d->clock_offset_ns;
+	d->wall_offset_ns = d->clock_offset_ns = wall_clock_first_offset();
 	d->started_ns = now(d);
 	if (getrandom(d->map_id, sizeof(d->map_id), GRND_NONBLOCK) < 0)
 		memcpy(d->map_id, &d->started_ns, sizeof(d->started_ns)); /* early at boot: the time will do */

@@ -17,31 +17,15 @@
 #include <string.h>
 #include <strings.h>
 
+#include "drivers/usb_list.h"
+
 #define PREFIX    "usb:"
-#define LEVELS    6 /* folders above the line that are looked at */
 #define LINE_MAX_ 64
 
 struct adapter {
 	char line[LINE_MAX_]; /* one of its lines */
 	char vendor[8], product[8], serial[80];
 };
-
-/* The first line of a small file; false: it is not there. */
-static bool read_line(const char *folder, const char *name, char *ret, size_t cap)
-{
-	char path[PATH_MAX + 32];
-	if (snprintf(path, sizeof path, "%s/%s", folder, name) >= (int)sizeof path)
-		return false;
-	FILE *file = fopen(path, "re");
-	if (file == NULL)
-		return false;
-	const bool read = fgets(ret, (int)cap, file) != NULL;
-	fclose(file);
-	if (!read)
-		return false;
-	ret[strcspn(ret, "\n")] = 0;
-	return true;
-}
 
 /* What the adapter of a line says of itself; false: it has none. */
 static bool adapter_of(const char *sys, const char *line, struct adapter *ret)
@@ -50,18 +34,11 @@ static bool adapter_of(const char *sys, const char *line, struct adapter *ret)
 	if (snprintf(link, sizeof link, "%s/class/tty/%s/device", sys, line) >= (int)sizeof link ||
 	    realpath(link, folder) == NULL)
 		return false;
-	for (int level = 0; level < LEVELS; level++) {
-		if (read_line(folder, "idVendor", ret->vendor, sizeof ret->vendor)) {
-			ret->serial[0] = 0;
-			read_line(folder, "serial", ret->serial, sizeof ret->serial);
-			return read_line(folder, "idProduct", ret->product, sizeof ret->product);
-		}
-		char *slash = strrchr(folder, '/');
-		if (slash == NULL || slash == folder)
-			return false;
-		*slash = 0;
-	}
-	return false;
+	if (!usb_list_above(folder))
+		return false;
+	usb_list_value(folder, "idVendor", ret->vendor, sizeof ret->vendor);
+	usb_list_value(folder, "serial", ret->serial, sizeof ret->serial);
+	return usb_list_value(folder, "idProduct", ret->product, sizeof ret->product);
 }
 
 /* usb:VENDOR:PRODUCT[:SERIAL] in its parts. */

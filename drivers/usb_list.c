@@ -39,6 +39,20 @@ bool usb_list_value(const char *folder, const char *name, char *ret, size_t cap)
 	return true;
 }
 
+bool usb_list_above(char *folder)
+{
+	char vendor[8];
+
+	while (!usb_list_value(folder, "idVendor", vendor, sizeof(vendor))) {
+		char *slash = strrchr(folder, '/');
+
+		if (!slash || slash == folder)
+			return false;
+		*slash = 0;
+	}
+	return true;
+}
+
 static unsigned long read_number(const char *folder, const char *name, int base)
 {
 	char text[16];

@@ -30,6 +30,9 @@ const char *usb_list_name(const struct usb_device *list, int n, int i);
  * trusted. False, and empty: there is none. */
 bool usb_list_value(const char *folder, const char *name, char *ret, size_t cap);
 
+/* Cuts `folder`, somewhere below a USB device in sysfs, back to that device's own. False: it is below none. */
+bool usb_list_above(char *folder);
+
 /* Tries to open the device's node: 0, or -errno with why it cannot and what to do. */
 int usb_list_permitted(const struct usb_device *, char why[160]);
 

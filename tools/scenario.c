@@ -13,20 +13,19 @@
 #include <string.h>
 #include <sys/socket.h>
 #include <sys/un.h>
-#include <time.h>
 #include <unistd.h>
 
 #include "config/address.h"
 #include "core/trig.h"
+#include "daemon/wall_clock.h"
 #include "drivers/pose_line.h"
 #include "tools/output.h"
 #include "tools/sim_control.h"
 #include "tools/sim_gadget.h"
 
 #define POSE_MS  10
-#define LOOK_NS  200000 /* two clocks that were read within so long belong together */
-#define UNIT     1      /* of the servo */
-#define LASER_BD 9600   /* as from the factory */
+#define UNIT     1    /* of the servo */
+#define LASER_BD 9600 /* as from the factory */
 #define MODE_15  0x05
 #define YAML_MAX 4096
 #define TICK_DEG 0.01 /* of the encoder in a scanner's telegrams */
@@ -62,14 +61,6 @@ struct scenario {
 bool scenario_is_world(const char *name)
 {
 	return strncmp(name, "uos:", 4) != 0 && strncmp(name, "profiles:", 9) != 0;
-}
-
-static int64_t clock_ns(clockid_t clock)
-{
-	struct timespec ts;
-
-	clock_gettime(clock, &ts);
-	return (int64_t)ts.tv_sec * 1000000000 + ts.tv_nsec;
 }
 
 /* ---- the configuration ---- */
@@ -167,25 +158,15 @@ static int write_yaml(const struct scenario *s, char error[SCENARIO_ERROR_MAX])
 
 /* ---- running ---- */
 
-/* False: the machine did something else between the two looks; what was seen before holds on. */
-static bool look_at_clocks(struct scenario *s)
-{
-	int64_t before_ns = clock_ns(CLOCK_MONOTONIC), wall_ns = clock_ns(CLOCK_REALTIME);
-	int64_t apart_ns = clock_ns(CLOCK_MONOTONIC) - before_ns;
-
-	if (apart_ns > LOOK_NS)
-		return false;
-	s->realtime_ns = wall_ns - before_ns - apart_ns / 2;
-	return true;
-}
-
 static void send_pose(struct scenario *s, int64_t now_ns)
 {
 	struct pose pose = s->stage.pose(s->stage.ctx, now_ns);
 	char line[POSE_LINE_MAX];
+	int64_t offset_ns;
 	int n;
 
-	look_at_clocks(s);
+	if (wall_clock_offset(&offset_ns))
+		s->realtime_ns = offset_ns;
 	pose.t_ns = now_ns + s->realtime_ns;
 	n = pose_line_print(&pose, line, sizeof line);
 	if (n > 0 &&
@@ -198,7 +179,7 @@ static void send_pose(struct scenario *s, int64_t now_ns)
 static void on_timer(uv_timer_t *timer)
 {
 	struct scenario *s = timer->data;
-	int64_t now_ns = clock_ns(CLOCK_MONOTONIC);
+	int64_t now_ns = wall_clock_read(CLOCK_MONOTONIC);
 	char said[80];
 
 	if (!s->mute)
@@ -225,7 +206,7 @@ static int create_brain(struct scenario *s)
 	                                     .ticks_per_rad = 1.0 / (TICK_DEG * TRIG_DEG),
 	                                     .angle = s->params.encoder ? servo_angle : NULL,
 	                                     .ctx = s};
-	int64_t now_ns = clock_ns(CLOCK_MONOTONIC);
+	int64_t now_ns = wall_clock_read(CLOCK_MONOTONIC);
 
 	return s->params.laser == SCENARIO_LMS2XX ? sim_lms2xx_create(&lms, &s->stage.scene, now_ns, &s->laser)
 	                                          : sim_cola_create(&cola, &s->stage.scene, now_ns, &s->laser);
@@ -337,8 +318,7 @@ static int start_poses(struct scenario *s, uv_loop_t *loop, char error[SCENARIO_
 		snprintf(error, SCENARIO_ERROR_MAX, "no socket for the poses: %s", strerror(errno));
 		return -EIO;
 	}
-	while (!look_at_clocks(s))
-		;
+	s->realtime_ns = wall_clock_first_offset();
 	uv_timer_init(loop, s->timer);
 	s->timer->data = s;
 	uv_timer_start(s->timer, on_timer, 0, POSE_MS);

@@ -49,26 +49,22 @@ static void read_driver(const char *device, char *ret, size_t cap)
 	} while (strchr(dir + 1, '/') && (strcmp(ret, "port") == 0 || strcmp(ret, "ctrl") == 0));
 }
 
-/* Goes up from `dir` to the folder of a USB device, if it is below one. */
+/* What the adapter says of itself, if there is one; `dir` is cut. */
 static void read_usb(char *dir, struct serial_line *line)
 {
 	char vendor[8], product[8], maker[24], title[40];
 
-	while (strlen(dir) > strlen("/sys/devices")) {
-		if (usb_list_value(dir, "idVendor", vendor, sizeof(vendor))) {
-			usb_list_value(dir, "idProduct", product, sizeof(product));
-			usb_list_value(dir, "manufacturer", maker, sizeof(maker));
-			usb_list_value(dir, "product", title, sizeof(title));
-			usb_list_value(dir, "serial", line->serial, sizeof(line->serial));
-			line->vendor = (uint16_t)strtoul(vendor, NULL, 16);
-			line->product = (uint16_t)strtoul(product, NULL, 16);
-			snprintf(line->name, sizeof(line->name), "%s%s%s", maker, maker[0] && title[0] ? " " : "",
-			         title);
-			snprintf(line->port, sizeof(line->port), "%.31s", last_part(dir));
-			return;
-		}
-		*strrchr(dir, '/') = 0;
-	}
+	if (!usb_list_above(dir))
+		return;
+	usb_list_value(dir, "idVendor", vendor, sizeof(vendor));
+	usb_list_value(dir, "idProduct", product, sizeof(product));
+	usb_list_value(dir, "manufacturer", maker, sizeof(maker));
+	usb_list_value(dir, "product", title, sizeof(title));
+	usb_list_value(dir, "serial", line->serial, sizeof(line->serial));
+	line->vendor = (uint16_t)strtoul(vendor, NULL, 16);
+	line->product = (uint16_t)strtoul(product, NULL, 16);
+	snprintf(line->name, sizeof(line->name), "%s%s%s", maker, maker[0] && title[0] ? " " : "", title);
+	snprintf(line->port, sizeof(line->port), "%.31s", last_part(dir));
 }
 
 /* False: a terminal without hardware, or a port of a PC that is not there (type 0). */

@@ -42,7 +42,7 @@ static const struct config_device *find_device(const struct config *config, cons
 
 static bool is_tilt(const struct config_device *device)
 {
-	return keys_driver(device->driver) == KEY_MODBUS || device->encoder.set;
+	return keys_driver(device->driver) & (KEY_SERVO | KEY_CAN) || device->encoder.set;
 }
 
 /* The name of the first device that tilts, for messages. */
@@ -80,6 +80,16 @@ static bool is_usb(const struct config_device *device)
 	return is_cola(device) && strncmp(device->connect, "usb", 3) == 0;
 }
 
+/* Several devices may be on one bus; on Modbus each has its own unit. */
+static bool is_shared(const struct config_device *a, const struct config_device *b)
+{
+	const unsigned mine = keys_driver(a->driver), theirs = keys_driver(b->driver);
+	if (mine & KEY_ON_CAN && theirs & KEY_ON_CAN)
+		return true;
+	return mine == KEY_MODBUS && theirs == KEY_MODBUS && a->slave != b->slave && a->baud == b->baud &&
+	       a->parity == b->parity;
+}
+
 /* Two ways to write one address are one line. */
 static bool is_same_line(const struct config_device *a, const struct config_device *b)
 {
@@ -105,7 +115,7 @@ static int check_line_shared(struct reader *r, const struct config *config, int 
 			                   "devices[%d].connect: with two scanners on USB `usb` says too little; write "
 			                   "usb:SERIAL or usb:BUS-PORT at both ('%s' is the other)",
 			                   i, other->name);
-		if (is_same_line(device, other))
+		if (is_same_line(device, other) && !is_shared(device, other))
 			return reader_fail(r, device_line(r, i, key), "devices[%d]: '%s' is already the line of '%s'",
 			                   i, device->port[0] ? device->port : device->connect, other->name);
 	}
@@ -194,14 +204,82 @@ static int check_modbus(struct reader *r, const struct config_device *device, in
 			return reader_fail(r, device_line(r, i, registers[k].name),
 			                   "devices[%d].%s.address: with address_base 1 the first register is 1", i,
 			                   registers[k].name);
-	for (int k = 0; k < device->writes; k++)
-		if (device->write[k].address < device->address_base)
-			return reader_fail(r, device_line(r, i, "write"),
-			                   "devices[%d].write: with address_base 1 the first register is 1", i);
+	const struct {
+		const char *name;
+		const struct config_writes *list;
+	} sequences[] = {{"write", &device->write}, {"reset", &device->reset}, {"stop", &device->stop}};
+	for (size_t k = 0; k < 3; k++)
+		for (int j = 0; j < sequences[k].list->n; j++)
+			if (sequences[k].list->item[j].address < device->address_base)
+				return reader_fail(r, device_line(r, i, sequences[k].name),
+				                   "devices[%d].%s: with address_base 1 the first register is 1", i,
+				                   sequences[k].name);
 	struct address address;
 	char sentence[ADDRESS_ERROR_MAX];
 	if (device->connect[0] != '/' && address_parse_host(device->connect, &address, sentence))
 		return reader_fail(r, device_line(r, i, "connect"), "devices[%d].connect: %s", i, sentence);
+	return 0;
+}
+
+/* An interface's name, or a socket. */
+static int check_can(struct reader *r, const struct config_device *device, int i)
+{
+	char shown[READER_SHOWN_MAX], sentence[ADDRESS_ERROR_MAX];
+	struct address address;
+	const char *c = device->connect;
+	if (strncmp(c, "unix:", 5) == 0)
+		return address_parse(c, ADDRESS_UNIX, &address, sentence)
+		           ? reader_fail(r, device_line(r, i, "connect"), "devices[%d].connect: %s", i, sentence)
+		           : 0;
+	while (isgraph((unsigned char)*c) && *c != '/' && *c != ':')
+		c++;
+	return !*c && c - device->connect <= 15
+	           ? 0
+	           : reader_fail(r, device_line(r, i, "connect"),
+	                         "devices[%d].connect: '%s' is no CAN interface (like can0) and no unix:PATH", i,
+	                         reader_shown(device->connect, shown));
+}
+
+static int check_canopen(struct reader *r, const struct config *config, int i)
+{
+	const struct config_device *device = &config->device[i];
+	if (device->node == device->master)
+		return reader_fail(r, device_line(r, i, "node"),
+		                   "devices[%d].node: %d is our own id; write another `master`", i, device->node);
+	if (device->count.scale == 0 && (device->kind == CANOPEN_DRIVE || device->kind == CANOPEN_ENCODER))
+		return reader_fail(r, device->line, "devices[%d]: `scale` is missing: the angle of one count", i);
+	for (int j = 0; j < i; j++) {
+		const struct config_device *other = &config->device[j];
+		if (keys_driver(other->driver) != KEY_CANOPEN || strcmp(other->connect, device->connect) != 0)
+			continue;
+		if (other->node == device->node)
+			return reader_fail(r, device_line(r, i, "node"),
+			                   "devices[%d].node: %d is already the node of '%s'", i, device->node,
+			                   other->name);
+		if (other->sync_ns > 0 && device->sync_ns > 0)
+			return reader_fail(r, device_line(r, i, "sync"),
+			                   "devices[%d].sync: '%s' already sends SYNC on %s; write `sync: 0` here", i,
+			                   other->name, device->connect);
+	}
+	return 0;
+}
+
+static int check_odometry(struct reader *r, const struct config *config, int i)
+{
+	const struct config_device *device = &config->device[i];
+	const bool speeds = device->ahead.set || device->turn.set, wheels = device->left.set || device->right.set;
+	for (int j = 0; j < i; j++)
+		if (keys_driver(config->device[j].driver) == KEY_ODOMETRY)
+			return reader_fail(r, device->line,
+			                   "devices[%d]: '%s' already tells the motion; one odometry is possible", i,
+			                   config->device[j].name);
+	if (speeds == wheels || (speeds && !(device->ahead.set && device->turn.set)) ||
+	    (wheels && !(device->left.set && device->right.set)))
+		return reader_fail(r, device->line,
+		                   "devices[%d]: an odometry has either `speed` and `turn`, or `left` and `right`", i);
+	if (wheels && device->track_m <= 0)
+		return reader_fail(r, device_line(r, i, "track"),
+		                   "devices[%d].track: the distance between the wheels is missing", i);
 	return 0;
 }
 
@@ -242,9 +320,32 @@ static int check_device(struct reader *r, const struct config *config, int i)
 		error = check_lms2xx(r, device, i);
 	if (!error && is_cola(device))
 		error = check_cola(r, device, i);
+	if (!error && keys_driver(device->driver) & KEY_ON_CAN)
+		error = check_can(r, device, i);
+	if (!error && keys_driver(device->driver) == KEY_CANOPEN)
+		error = check_canopen(r, config, i);
+	if (!error && keys_driver(device->driver) == KEY_ODOMETRY)
+		error = check_odometry(r, config, i);
 	if (!error && keys_driver(device->driver) == KEY_POSE)
 		error = check_pose(r, config, i);
 	return error;
+}
+
+/* What can be known beforehand is refused beforehand. */
+static int check_limits(struct reader *r, const struct config *config, const struct config_device *servo, int node)
+{
+	const struct {
+		const char *name;
+		double rad;
+		bool set;
+	} targets[] = {{"from", config->sweep.from_rad, true},
+	               {"to", config->sweep.to_rad, true},
+	               {"rest", config->sweep.rest_rad, config->sweep.has_rest}};
+	for (size_t i = 0; i < 3 && servo->has_limits; i++)
+		if (targets[i].set && (targets[i].rad < servo->limits_rad[0] || targets[i].rad > servo->limits_rad[1]))
+			return reader_fail(r, reader_line(r, node, targets[i].name),
+			                   "sweep.%s: lies outside the limits of '%s'", targets[i].name, servo->name);
+	return 0;
 }
 
 static int check_sweep(struct reader *r, const struct config *config)
@@ -256,13 +357,18 @@ static int check_sweep(struct reader *r, const struct config *config)
 	    check_tilt_name(r, config, "sweep.device", config->sweep.device, reader_line(r, node, "device"));
 	if (error)
 		return error;
-	if (!find_device(config, config->sweep.device)->target.set)
+	const struct config_device *servo = find_device(config, config->sweep.device);
+	if (keys_driver(servo->driver) == KEY_MODBUS
+	        ? !servo->target.set
+	        : keys_driver(servo->driver) != KEY_CANOPEN || servo->kind == CANOPEN_ENCODER ||
+	              servo->kind == CANOPEN_INCLINOMETER)
 		return reader_fail(r, reader_line(r, node, "device"),
-		                   "sweep.device: '%s' has no `target` register, so it cannot be commanded",
-		                   config->sweep.device);
+		                   "sweep.device: '%s' %s, so it cannot be commanded", config->sweep.device,
+		                   keys_driver(servo->driver) == KEY_MODBUS ? "has no `target` register"
+		                                                            : "only tells its angle");
 	if (config->sweep.from_rad >= config->sweep.to_rad)
 		return reader_fail(r, reader_line(r, node, "from"), "sweep.from: must be smaller than sweep.to");
-	return 0;
+	return check_limits(r, config, servo, node);
 }
 
 static int check_box(struct reader *r, const struct config *config)

@@ -26,6 +26,47 @@ struct config_register { /* a Modbus value */
 	int sign;     /* +1 or -1 */
 };
 
+/* A number in a CAN frame, as DBC files describe it (protocols C.1): quantity = raw * scale + offset, in SI. */
+struct config_signal {
+	bool set;
+	uint32_t id; /* 11 bits, or 29 where `extended` */
+	bool extended;
+	int start, length; /* DBC's bit numbers: intel, of the lowest bit; motorola, of the highest */
+	enum { SIGNAL_INTEL, SIGNAL_MOTOROLA } order;
+	enum { SIGNAL_SIGNED, SIGNAL_UNSIGNED, SIGNAL_FLOAT } type; /* float: 32 or 64 bits */
+	double scale, offset;
+	double wrap; /* raw counts after which the device counts from 0 again; 0: it never does */
+	int min_dlc; /* bytes; shorter frames are refused */
+	struct {
+		bool set;
+		int start, length; /* goes up by one from frame to frame; order as the signal's */
+	} counter;
+	struct {
+		bool set;
+		int bit;   /* intel numbering */
+		int value; /* 0 or 1: the signal is good then */
+	} valid;
+	struct {
+		bool set;
+		int start, length; /* order as the signal's */
+		int64_t value;     /* the signal is in frames whose multiplexor says this */
+	} mux;
+};
+
+struct config_write { /* one step of a sequence of writes to a Modbus device */
+	uint16_t address, value;
+	int64_t delay_ns; /* to wait after it was answered */
+	struct {
+		bool set;
+		uint16_t address, mask, value; /* read until (register & mask) == value ... */
+		int64_t within_ns;             /* ... or it has failed */
+	} until;                               /* before the next step */
+};
+struct config_writes {
+	int n;
+	struct config_write item[CONFIG_WRITES_MAX];
+};
+
 struct config_device {
 	char name[CONFIG_NAME_MAX];
 	char driver[CONFIG_NAME_MAX]; /* a name of keys_driver */
@@ -73,13 +114,63 @@ struct config_device {
 	int64_t period_ns; /* between polls; 0: as fast as the answers come */
 	int address_base;  /* 0 or 1 */
 	struct config_register position, target, speed;
+	struct config_writes write; /* at every start: enable, home, ... */
+	struct config_writes reset; /* once, when `status` says that it has a fault */
+	struct config_writes stop;  /* at an orderly end, after the rest angle was reached */
 	struct {
-		uint16_t address;
-		uint16_t value;
-	} write[CONFIG_WRITES_MAX]; /* sent once at start-up */
-	int writes;
+		bool set;
+		uint16_t address, on, off;
+	} strobe; /* written after every target: `on`, then `off` */
+	struct {
+		bool set;
+		uint16_t address, value, toggle; /* these bits change from one time to the next */
+		int64_t period_ns;
+	} watchdog; /* the drive stops by itself when nobody writes it any more */
+	struct {
+		bool set;
+		uint8_t function;        /* 3 or 4 */
+		uint16_t address, fault; /* any of these bits: it has a fault */
+	} status;
+
+	/* every commanded servo */
+	bool has_limits;
+	double limits_rad[2]; /* no target is ever sent that lies outside */
+	double
+	    following_rad; /* so far from where it was told to be, or not moving at all: the sweep stops; 0: not judged */
+	int64_t timeout_ns; /* can, canopen, odometry: nothing for so long: lost */
+
+	/* can: the angle. odometry: speed and rate of turn, or the ways of two wheels */
+	struct config_signal angle, ahead, turn, left, right;
+	double track_m;                 /* between the wheels */
+	double drift, turn_drift_rad_m; /* sigma: of a way, per metre of it; of the heading, per metre */
+	double trust_m;                 /* rows are dropped while the position's sigma is larger; 0: never */
+
+	/* canopen */
+	int node, master; /* its id, and ours */
+	enum { CANOPEN_AUTO, CANOPEN_DRIVE, CANOPEN_ENCODER, CANOPEN_INCLINOMETER } kind;
+	int64_t sync_ns;      /* we produce SYNC so often; 0: somebody else does, or nobody */
+	int64_t heartbeat_ns; /* ours and its; 0: none */
+	enum { CANOPEN_POSITION, CANOPEN_VELOCITY, CANOPEN_CYCLIC } drive_mode; /* `mode` of a drive */
+	enum { CANOPEN_LONGITUDINAL, CANOPEN_LATERAL } axis;                    /* of an inclinometer */
+	struct {
+		bool set;
+		double scale; /* rad of a count; angle = sign * scale * (count - zero) */
+		double zero;  /* counts */
+		int sign;
+		double wrap; /* counts after which it counts from 0 again; 0: never */
+	} count;
+	double acceleration_rad_s2;
+	struct {
+		bool set;
+		int method; /* CiA 402, 6098 */
+		double speed_rad_s;
+		double offset_rad; /* the angle at the home position */
+		int64_t within_ns;
+	} homing;
 
 	/* pose */
+	enum { JUMP_KEEP, JUMP_IGNORE, JUMP_NEW_MAP } on_jump;
+	double jump_m, jump_rad;      /* beyond what the motion explains: a jump */
 	char listen[CONFIG_TEXT_MAX]; /* unix:PATH or udp:HOST:PORT */
 	bool fixed;
 	struct transform fixed_pose; /* map <- base */
@@ -93,6 +184,8 @@ struct config {
 		int lookahead;          /* rows */
 		uint64_t memory;        /* bytes */
 		int64_t hold_ns;
+		char archive
+		    [CONFIG_TEXT_MAX]; /* where a map that ends by a jump is saved; empty: the working directory */
 	} map;
 	struct {
 		bool has_box;

@@ -13,15 +13,20 @@
 	.offset = offsetof(struct config_device, member), .size = sizeof(((struct config_device *)0)->member)
 #define REGISTER_(member) \
 	.offset = offsetof(struct config_register, member), .size = sizeof(((struct config_register *)0)->member)
-#define DEG(x) ((x)*0.017453292519943295)
-#define MEGA   1048576.0
+#define WRITE(member) \
+	.offset = offsetof(struct config_write, member), .size = sizeof(((struct config_write *)0)->member)
+#define SIGNAL(member) \
+	.offset = offsetof(struct config_signal, member), .size = sizeof(((struct config_signal *)0)->member)
+#define DEVICE_FLAG(member) .flag = offsetof(struct config_device, member)
+#define DEG(x)              ((x)*0.017453292519943295)
+#define MEGA                1048576.0
 
 /* clang-format off */
 const struct key key_table[] = {
 	{GROUP_TOP, "map", KEY_GROUP, .inner = GROUP_MAP, .help = "The map: a signed distance in every voxel near a surface, turned into triangles."},
 	{GROUP_TOP, "robot", KEY_GROUP, .inner = GROUP_ROBOT, .help = "The robot's own body and what it can climb."},
 	{GROUP_TOP, "mount", KEY_GROUP, .inner = GROUP_MOUNT, .help = "Where the scanner sits: map <- base <- tilt axis <- laser, x forward, y left, z up. The lever arm from the axis to the mirror's centre matters: without it walls become double."},
-	{GROUP_TOP, "devices", KEY_DEVICES, .inner = GROUP_DEVICE, .help = "What is plugged in; at most 16. Every device has a name and a driver: lms2xx (SICK LMS200, 211, 220, 221, 291), tim (SICK TiM3xx, 5xx, 7xx), lms1xx, lms5xx, modbus (a servo that tilts the scanner), pose (the robot's localisation)."},
+	{GROUP_TOP, "devices", KEY_DEVICES, .inner = GROUP_DEVICE, .help = "What is plugged in; at most 16. Every device has a name and a driver: lms2xx (SICK LMS200, 211, 220, 221, 291), tim (SICK TiM3xx, 5xx, 7xx), lms1xx, lms5xx, modbus and canopen (servos that tilt the scanner, or tell its angle), can (its angle in a CAN frame), pose (the robot's localisation), odometry (the motion of its wheels, in CAN frames)."},
 	{GROUP_TOP, "sweep", KEY_GROUP, .inner = GROUP_SWEEP, .flag = offsetof(struct config, sweep.set), .help = "How the servo is commanded. Without this section it is only listened to."},
 	{GROUP_TOP, "listen", KEY_GROUP, .inner = GROUP_LISTEN, .help = "Where clients connect."},
 	{GROUP_TOP, "record", KEY_GROUP, .inner = GROUP_RECORD, .help = "Recordings of what the devices sent."},
@@ -36,6 +41,7 @@ const struct key key_table[] = {
 	{GROUP_MAP, "lookahead", KEY_INTEGER, .preset = "2", .min = 0, .max = 2, CONFIG(map.lookahead), .help = "Rows a row waits for, so that its normals know both sides. Counts as latency."},
 	{GROUP_MAP, "memory", KEY_INTEGER, .preset = "256M", .dimension = DIMENSION_BYTES, .min = 16 * MEGA, .max = 65536 * MEGA, CONFIG(map.memory), .help = "What the voxels of the map may take. At the limit new blocks are refused, counted and reported; meshes and what is on its way to clients come on top."},
 	{GROUP_MAP, "hold", KEY_DURATION, .preset = "30ms", .dimension = DIMENSION_TIME, .min = 0, .max = 1, CONFIG(map.hold_ns), .help = "How long a profile waits for newer tilt and pose samples."},
+	{GROUP_MAP, "archive", KEY_TEXT, .preset = "", CONFIG(map.archive), .help = "Where a map that ends by `on_jump: new_map` is saved, as ID.ply; empty: the working directory."},
 	{GROUP_MAP, "window", KEY_TEXT, .preset = "none", .later = "a map that forgets what lies far behind", .help = "Keep only what is near the robot."},
 
 	{GROUP_ROBOT, "box", KEY_GROUP, .inner = GROUP_BOX, .flag = offsetof(struct config, robot.has_box), .example = "{min: [-0.4, -0.3, -0.5], max: [0.3, 0.3, 0.2]}", .help = "Beams that end in this box of the base frame are the robot itself: dropped, and they clear nothing. Leave it out where no beam can hit the robot."},
@@ -50,7 +56,7 @@ const struct key key_table[] = {
 	{GROUP_FRAME, "rpy", KEY_VECTOR, .preset = "[0, 0, 0]", .dimension = DIMENSION_ANGLE, .min = DEG(-360), .max = DEG(360), .offset = sizeof(struct vec3), .size = sizeof(struct vec3), .help = "Roll, pitch, yaw about the fixed axes x, y, z."},
 
 	{GROUP_DEVICE, "name", KEY_TEXT, KEY_ALL, .required = true, DEVICE(name), .help = "What messages, `tilt` and `sweep.device` call it: letters, digits, - and _."},
-	{GROUP_DEVICE, "driver", KEY_TEXT, KEY_ALL, .required = true, .choices = "lms2xx|modbus|pose|tim|lms1xx|lms5xx", DEVICE(driver), .help = "What it is."},
+	{GROUP_DEVICE, "driver", KEY_TEXT, KEY_ALL, .required = true, .choices = "lms2xx|modbus|pose|tim|lms1xx|lms5xx|can|canopen|odometry", DEVICE(driver), .help = "What it is."},
 
 	{GROUP_DEVICE, "port", KEY_TEXT, KEY_LMS2XX, .required = true, .example = "/dev/ttyUSB0", DEVICE(port), .help = "Serial line: a path (names under /dev/serial/by-id/ stay the same over reboots), or usb:VENDOR:PRODUCT[:SERIAL], an adapter wherever it is plugged in."},
 	{GROUP_DEVICE, "baud", KEY_INTEGER, KEY_LMS2XX, .preset = "38400", .example = "500000", .choices = "9600|19200|38400|500000", DEVICE(baud), .help = "Rate to stream at; the rate the scanner has now is found. 500000 needs RS-422."},
@@ -88,9 +94,46 @@ const struct key key_table[] = {
 	{GROUP_DEVICE, "position", KEY_REGISTER, KEY_MODBUS, .required = true, .example = "{function: 3, address: 0, type: i32, order: ABCD, scale: 0.001deg, zero: 0, sign: 1}", .inner = GROUP_REGISTER, DEVICE(position), .help = "Where the angle is read: angle = sign * scale * (raw - zero); positive looks down."},
 	{GROUP_DEVICE, "target", KEY_REGISTER, KEY_MODBUS, .example = "{function: 16, address: 2, type: i32, scale: 0.001deg}", .inner = GROUP_REGISTER, DEVICE(target), .help = "Where the wanted angle is written; needed for `sweep`."},
 	{GROUP_DEVICE, "speed", KEY_REGISTER, KEY_MODBUS, .example = "{function: 16, address: 4, type: u32, scale: 0.001deg/s}", .inner = GROUP_REGISTER, DEVICE(speed), .help = "Where the wanted speed is written."},
-	{GROUP_DEVICE, "write", KEY_WRITES, KEY_MODBUS, .preset = "[]", .inner = GROUP_WRITE, .help = "Registers written once at every start, in this order, e.g. [{address: 16, value: 1}]."},
+	{GROUP_DEVICE, "write", KEY_WRITES, KEY_MODBUS, .preset = "[]", .inner = GROUP_WRITE, DEVICE(write), .help = "Registers written at every start, in this order: enable, home, ... E.g. [{address: 16, value: 6}, {address: 16, value: 15, until: {address: 6, mask: 0x27, value: 0x27}}]."},
+	{GROUP_DEVICE, "strobe", KEY_GROUP, KEY_MODBUS, .inner = GROUP_STROBE, DEVICE_FLAG(strobe.set), .example = "{address: 16, on: 31, off: 15}", .help = "For drives that take a target at an edge: written after every target, first `on`, then `off`."},
+	{GROUP_DEVICE, "watchdog", KEY_GROUP, KEY_MODBUS, .inner = GROUP_WATCHDOG, DEVICE_FLAG(watchdog.set), .example = "{address: 20, value: 0, toggle: 1, period: 100ms}", .help = "The register by which the drive notices that facetd has died, and stops by itself. How long that takes is set in the drive."},
+	{GROUP_DEVICE, "status", KEY_GROUP, KEY_MODBUS, .inner = GROUP_STATUS, DEVICE_FLAG(status.set), .example = "{function: 3, address: 6, fault: 0x08}", .help = "Where the drive says that it has a fault: the sweep stops then."},
+	{GROUP_DEVICE, "reset", KEY_WRITES, KEY_MODBUS, .preset = "[]", .inner = GROUP_WRITE, DEVICE(reset), .help = "Registers written when `status` says fault, once; then `write` again. A fault that stays is reported."},
+	{GROUP_DEVICE, "stop", KEY_WRITES, KEY_MODBUS, .preset = "[]", .inner = GROUP_WRITE, DEVICE(stop), .help = "Registers written at an orderly end, after the rest angle was reached: disable."},
+
+	{GROUP_DEVICE, "connect", KEY_TEXT, KEY_ON_CAN, .required = true, .example = "can0", DEVICE(connect), .help = "The CAN interface, which the system brings up (`ip link set can0 up type can bitrate 500000 restart-ms 100`, or systemd-networkd); or unix:PATH, a socket that carries frames (docs/simulators.md)."},
+	{GROUP_DEVICE, "angle", KEY_SIGNAL, KEY_CAN, .required = true, .inner = GROUP_SIGNAL, DEVICE(angle), .example = "{id: 0x181, start: 0, length: 16, order: intel, type: signed, scale: 0.01deg}", .help = "The frame and the bits that hold the angle; positive looks down."},
+	{GROUP_DEVICE, "node", KEY_INTEGER, KEY_CANOPEN, .required = true, .example = "5", .min = 1, .max = 127, DEVICE(node), .help = "Its CANopen node id."},
+	{GROUP_DEVICE, "master", KEY_INTEGER, KEY_CANOPEN, .preset = "127", .min = 1, .max = 127, DEVICE(master), .help = "The node id of facetd itself, which the drive's heartbeat consumer watches."},
+	{GROUP_DEVICE, "kind", KEY_CHOICE, KEY_CANOPEN, .preset = "auto", .choices = "auto|drive|encoder|inclinometer", DEVICE(kind), .help = "drive: CiA 402; encoder: CiA 406; inclinometer: CiA 410; auto: by its object 1000."},
+	{GROUP_DEVICE, "scale", KEY_REAL, KEY_CANOPEN, .preset = "0", .example = "0.001deg", .dimension = DIMENSION_ANGLE, .min = 0, .max = DEG(360), DEVICE(count.scale), .help = "Angle of one count; angle = sign * scale * (count - zero). 0: as the inclinometer says; an encoder and a drive need it."},
+	{GROUP_DEVICE, "zero", KEY_REAL, KEY_CANOPEN, .preset = "0", DEVICE(count.zero), .help = "Counts at angle 0."},
+	{GROUP_DEVICE, "sign", KEY_INTEGER, KEY_CANOPEN, .preset = "1", .choices = "1|-1", DEVICE(count.sign), .help = "-1 where the device counts up when the scanner looks up."},
+	{GROUP_DEVICE, "wrap", KEY_REAL, KEY_CANOPEN, .preset = "0", .min = 0, .max = 4294967296.0, DEVICE(count.wrap), .help = "Counts after which the device counts from 0 again; 0: it never does."},
+	{GROUP_DEVICE, "axis", KEY_CHOICE, KEY_CANOPEN, .preset = "longitudinal", .choices = "longitudinal|lateral", DEVICE(axis), .help = "Of an inclinometer: object 6010 or 6020."},
+	{GROUP_DEVICE, "sync", KEY_DURATION, KEY_CANOPEN, .preset = "10ms", .dimension = DIMENSION_TIME, .min = 0, .max = 1, DEVICE(sync_ns), .help = "SYNC is sent so often, and the angle was measured at it; 0: somebody else sends it, or nobody."},
+	{GROUP_DEVICE, "heartbeat", KEY_DURATION, KEY_CANOPEN, .preset = "200ms", .dimension = DIMENSION_TIME, .min = 0, .max = 10, DEVICE(heartbeat_ns), .help = "Heartbeats of both sides. The drive is told to stop when three of ours are missing; 0: none, and it then goes on if facetd dies."},
+	{GROUP_DEVICE, "mode", KEY_CHOICE, KEY_CANOPEN, .preset = "position", .choices = "position|velocity|cyclic", DEVICE(drive_mode), .help = "How a drive is commanded: profile position, profile velocity, or cyclic synchronous position at every SYNC."},
+	{GROUP_DEVICE, "acceleration", KEY_REAL, KEY_CANOPEN, .preset = "300deg", .dimension = DIMENSION_RATE, .min = DEG(0.1), .max = DEG(1e6), DEVICE(acceleration_rad_s2), .help = "Per second squared, at the turns."},
+	{GROUP_DEVICE, "homing", KEY_GROUP, KEY_CANOPEN, .inner = GROUP_HOMING, DEVICE_FLAG(homing.set), .example = "{method: 35, speed: 5deg, offset: 0deg}", .help = "Left out: the drive knows where it is."},
+
+	{GROUP_DEVICE, "limits", KEY_PAIR, KEY_SERVO, .dimension = DIMENSION_ANGLE, .min = DEG(-180), .max = DEG(180), .example = "[-70deg, 50deg]", DEVICE(limits_rad), DEVICE_FLAG(has_limits), .help = "Soft limits: a target outside is refused before it is sent. Those that a CANopen drive has itself hold too."},
+	{GROUP_DEVICE, "following", KEY_REAL, KEY_SERVO, .preset = "10deg", .dimension = DIMENSION_ANGLE, .min = 0, .max = DEG(180), DEVICE(following_rad), .help = "Following error: so far from where it should be, the sweep stops and says so; 0: not judged."},
+	{GROUP_DEVICE, "timeout", KEY_DURATION, KEY_ON_CAN, .preset = "500ms", .dimension = DIMENSION_TIME, .min = 0.01, .max = 60, DEVICE(timeout_ns), .help = "Without a good frame for so long, it counts as lost."},
+
+	{GROUP_DEVICE, "speed", KEY_SIGNAL, KEY_ODOMETRY, .inner = GROUP_SIGNAL, DEVICE(ahead), .example = "{id: 0x200, start: 0, length: 16, scale: 1mm/s}", .help = "Forward speed, m/s."},
+	{GROUP_DEVICE, "turn", KEY_SIGNAL, KEY_ODOMETRY, .inner = GROUP_SIGNAL, DEVICE(turn), .example = "{id: 0x200, start: 16, length: 16, scale: 0.1deg/s}", .help = "Rate of turn, positive to the left."},
+	{GROUP_DEVICE, "left", KEY_SIGNAL, KEY_ODOMETRY, .inner = GROUP_SIGNAL, DEVICE(left), .help = "Instead of speed and turn: what the left wheel's encoder counts; scale is the way of one count, wrap where it counts from 0 again (written or not, its length in bits)."},
+	{GROUP_DEVICE, "right", KEY_SIGNAL, KEY_ODOMETRY, .inner = GROUP_SIGNAL, DEVICE(right), .help = "The right wheel's."},
+	{GROUP_DEVICE, "track", KEY_REAL, KEY_ODOMETRY, .preset = "0", .dimension = DIMENSION_LENGTH, .min = 0, .max = 10, DEVICE(track_m), .help = "Between the wheels; needed with left and right."},
+	{GROUP_DEVICE, "drift", KEY_REAL, KEY_ODOMETRY, .preset = "0.02", .min = 0, .max = 1, DEVICE(drift), .help = "How wrong a way may be: sigma, metres per metre."},
+	{GROUP_DEVICE, "turn_drift", KEY_REAL, KEY_ODOMETRY, .preset = "1deg", .dimension = DIMENSION_ANGLE, .min = 0, .max = DEG(90), DEVICE(turn_drift_rad_m), .help = "How wrong the heading becomes: sigma per metre, and per radian turned."},
+	{GROUP_DEVICE, "trust", KEY_REAL, KEY_ODOMETRY, .preset = "0", .dimension = DIMENSION_LENGTH, .min = 0, .max = 1000, DEVICE(trust_m), .help = "Rows are dropped and counted while the position is less certain (sigma) than this, until an absolute pose comes; 0: odometry alone is good enough."},
 
 	{GROUP_DEVICE, "listen", KEY_TEXT, KEY_POSE, .example = "unix:/run/facetd/pose.sock", DEVICE(listen), .help = "Datagram socket for poses as JSON lines: unix:PATH or udp:HOST:PORT on loopback."},
+	{GROUP_DEVICE, "on_jump", KEY_CHOICE, KEY_POSE, .preset = "keep", .choices = "keep|ignore|new_map", DEVICE(on_jump), .help = "When the pose jumps (a loop was closed elsewhere), an event tells clients, and: keep: go on in the same map; ignore: hold the old correction; new_map: begin a new map and save the old one in map.archive."},
+	{GROUP_DEVICE, "jump", KEY_REAL, KEY_POSE, .preset = "0.3", .dimension = DIMENSION_LENGTH, .min = 0.001, .max = 1000, DEVICE(jump_m), .help = "A pose so far from where the motion before it leads is a jump."},
+	{GROUP_DEVICE, "jump_angle", KEY_REAL, KEY_POSE, .preset = "5deg", .dimension = DIMENSION_ANGLE, .min = DEG(0.1), .max = DEG(180), DEVICE(jump_rad), .help = "The same for its direction."},
 	{GROUP_DEVICE, "fixed", KEY_TRANSFORM, KEY_POSE, .inner = GROUP_FRAME, DEVICE(fixed_pose), .flag = offsetof(struct config_device, fixed), .help = "Instead of `listen`: the robot stands here, e.g. {xyz: [0, 0, 0], rpy: [0, 0, 90deg]}."},
 
 	{GROUP_REGISTER, "function", KEY_INTEGER, .preset = "auto", .word = "auto", .word_value = 0, .choices = "3|4|6|16", REGISTER_(function), .help = "Function code. Read: 3 holding, 4 input registers. Written: 6 single, 16 multiple. auto: 3 to read, 6 or 16 to write, by the type."},
@@ -100,8 +143,50 @@ const struct key key_table[] = {
 	{GROUP_REGISTER, "scale", KEY_REAL, .required = true, .dimension = DIMENSION_RATE, .min = DEG(1e-6), .max = DEG(360), REGISTER_(scale), .help = "Angle (or angle per second) of one count, e.g. 0.001deg."},
 	{GROUP_REGISTER, "zero", KEY_REAL, .preset = "0", REGISTER_(zero), .help = "Raw value at angle 0."},
 	{GROUP_REGISTER, "sign", KEY_INTEGER, .preset = "1", .choices = "1|-1", REGISTER_(sign), .help = "-1 where the device counts up when the scanner looks up."},
-	{GROUP_WRITE, "address", KEY_INTEGER, .required = true, .min = 0, .max = 65535, .offset = 0, .size = 2, .help = "Register."},
-	{GROUP_WRITE, "value", KEY_INTEGER, .required = true, .min = 0, .max = 65535, .offset = 2, .size = 2, .help = "What is written there."},
+	{GROUP_WRITE, "address", KEY_INTEGER, .required = true, .min = 0, .max = 65535, WRITE(address), .help = "Register."},
+	{GROUP_WRITE, "value", KEY_INTEGER, .required = true, .min = 0, .max = 65535, WRITE(value), .help = "What is written there."},
+	{GROUP_WRITE, "delay", KEY_DURATION, .preset = "0", .dimension = DIMENSION_TIME, .min = 0, .max = 60, WRITE(delay_ns), .help = "To wait after it was answered."},
+	{GROUP_WRITE, "until", KEY_GROUP, .inner = GROUP_UNTIL, .flag = offsetof(struct config_write, until.set), .example = "{address: 6, mask: 4, value: 4, within: 5s}", .help = "The next step waits until this holding register says so."},
+	{GROUP_UNTIL, "address", KEY_INTEGER, .required = true, .min = 0, .max = 65535, WRITE(until.address), .help = "Holding register."},
+	{GROUP_UNTIL, "mask", KEY_INTEGER, .preset = "65535", .min = 1, .max = 65535, WRITE(until.mask), .help = "Its bits that matter."},
+	{GROUP_UNTIL, "value", KEY_INTEGER, .required = true, .min = 0, .max = 65535, WRITE(until.value), .help = "What these bits must be."},
+	{GROUP_UNTIL, "within", KEY_DURATION, .preset = "5s", .dimension = DIMENSION_TIME, .min = 0.01, .max = 300, WRITE(until.within_ns), .help = "Later it has failed."},
+	{GROUP_STROBE, "address", KEY_INTEGER, .required = true, .min = 0, .max = 65535, DEVICE(strobe.address), .help = "Register."},
+	{GROUP_STROBE, "on", KEY_INTEGER, .required = true, .min = 0, .max = 65535, DEVICE(strobe.on), .help = "Written first."},
+	{GROUP_STROBE, "off", KEY_INTEGER, .required = true, .min = 0, .max = 65535, DEVICE(strobe.off), .help = "Written then."},
+	{GROUP_WATCHDOG, "address", KEY_INTEGER, .required = true, .min = 0, .max = 65535, DEVICE(watchdog.address), .help = "Register."},
+	{GROUP_WATCHDOG, "value", KEY_INTEGER, .preset = "1", .min = 0, .max = 65535, DEVICE(watchdog.value), .help = "What is written there."},
+	{GROUP_WATCHDOG, "toggle", KEY_INTEGER, .preset = "0", .min = 0, .max = 65535, DEVICE(watchdog.toggle), .help = "Its bits that change every time."},
+	{GROUP_WATCHDOG, "period", KEY_DURATION, .preset = "100ms", .dimension = DIMENSION_TIME, .min = 0.01, .max = 60, DEVICE(watchdog.period_ns), .help = "How often."},
+	{GROUP_STATUS, "function", KEY_INTEGER, .preset = "3", .choices = "3|4", DEVICE(status.function), .help = "3 holding, 4 input registers."},
+	{GROUP_STATUS, "address", KEY_INTEGER, .required = true, .min = 0, .max = 65535, DEVICE(status.address), .help = "Register."},
+	{GROUP_STATUS, "fault", KEY_INTEGER, .required = true, .min = 1, .max = 65535, DEVICE(status.fault), .help = "Bits of which none is set while all is well."},
+
+	{GROUP_SIGNAL, "id", KEY_INTEGER, .required = true, .min = 0, .max = 536870911.0, SIGNAL(id), .help = "Identifier, 0x181 or 385; in a DBC file extended ones have 0x80000000 added: leave that out here."},
+	{GROUP_SIGNAL, "extended", KEY_SWITCH, .preset = "off", SIGNAL(extended), .help = "An identifier of 29 bits."},
+	{GROUP_SIGNAL, "start", KEY_INTEGER, .preset = "0", .min = 0, .max = 511, SIGNAL(start), .help = "Start bit as in a DBC file: intel, the lowest bit; motorola, the highest."},
+	{GROUP_SIGNAL, "length", KEY_INTEGER, .preset = "16", .min = 1, .max = 64, SIGNAL(length), .help = "Bits."},
+	{GROUP_SIGNAL, "order", KEY_CHOICE, .preset = "intel", .choices = "intel|motorola", SIGNAL(order), .help = "In a DBC file: @1 intel, @0 motorola."},
+	{GROUP_SIGNAL, "type", KEY_CHOICE, .preset = "signed", .choices = "signed|unsigned|float", SIGNAL(type), .help = "In a DBC file: - signed, + unsigned."},
+	{GROUP_SIGNAL, "scale", KEY_REAL, .required = true, .dimension = DIMENSION_SIGNAL, SIGNAL(scale), .help = "quantity = raw * scale + offset; negative where it counts the other way."},
+	{GROUP_SIGNAL, "offset", KEY_REAL, .preset = "0", .dimension = DIMENSION_SIGNAL, SIGNAL(offset), .help = "The quantity where raw is 0."},
+	{GROUP_SIGNAL, "wrap", KEY_REAL, .preset = "0", SIGNAL(wrap), .help = "Raw counts after which the device counts from 0 again; 0: it never does."},
+	{GROUP_SIGNAL, "min_dlc", KEY_INTEGER, .preset = "0", .min = 0, .max = 64, SIGNAL(min_dlc), .help = "Shorter frames are refused; those that lack bits of the signal are in any case."},
+	{GROUP_SIGNAL, "counter", KEY_GROUP, .inner = GROUP_COUNTER, .flag = offsetof(struct config_signal, counter.set), .example = "{start: 56, length: 8}", .help = "Bits that go up by one from frame to frame: lost frames are counted."},
+	{GROUP_SIGNAL, "valid", KEY_GROUP, .inner = GROUP_VALID, .flag = offsetof(struct config_signal, valid.set), .example = "{bit: 48, value: 1}", .help = "The bit that says that the signal is good."},
+	{GROUP_SIGNAL, "mux", KEY_GROUP, .inner = GROUP_MUX, .flag = offsetof(struct config_signal, mux.set), .example = "{start: 0, length: 8, value: 3}", .help = "Only frames whose multiplexor has this value hold the signal."},
+	{GROUP_COUNTER, "start", KEY_INTEGER, .required = true, .min = 0, .max = 511, SIGNAL(counter.start), .help = "Start bit."},
+	{GROUP_COUNTER, "length", KEY_INTEGER, .required = true, .min = 1, .max = 32, SIGNAL(counter.length), .help = "Bits."},
+	{GROUP_VALID, "bit", KEY_INTEGER, .required = true, .min = 0, .max = 511, SIGNAL(valid.bit), .help = "Byte * 8 + bit."},
+	{GROUP_VALID, "value", KEY_INTEGER, .preset = "1", .choices = "0|1", SIGNAL(valid.value), .help = "What it is while the signal is good."},
+	{GROUP_MUX, "start", KEY_INTEGER, .required = true, .min = 0, .max = 511, SIGNAL(mux.start), .help = "Start bit."},
+	{GROUP_MUX, "length", KEY_INTEGER, .required = true, .min = 1, .max = 32, SIGNAL(mux.length), .help = "Bits."},
+	{GROUP_MUX, "value", KEY_INTEGER, .required = true, .min = 0, .max = 4294967295.0, SIGNAL(mux.value), .help = "What they must say."},
+
+	{GROUP_HOMING, "method", KEY_INTEGER, .required = true, .min = -128, .max = 127, DEVICE(homing.method), .help = "CiA 402, object 6098: 35 or 37 here is home; 1, 2, 17, 18 limit switches; 33, 34 index; below 0 the maker's."},
+	{GROUP_HOMING, "speed", KEY_REAL, .preset = "5deg", .dimension = DIMENSION_RATE, .min = DEG(0.001), .max = DEG(1000), DEVICE(homing.speed_rad_s), .help = "Per second."},
+	{GROUP_HOMING, "offset", KEY_REAL, .preset = "0deg", .dimension = DIMENSION_ANGLE, .min = DEG(-360), .max = DEG(360), DEVICE(homing.offset_rad), .help = "The angle at the home position."},
+	{GROUP_HOMING, "within", KEY_DURATION, .preset = "30s", .dimension = DIMENSION_TIME, .min = 0.1, .max = 600, DEVICE(homing.within_ns), .help = "Later it has failed."},
 
 	{GROUP_ENCODER, "scale", KEY_REAL, .required = true, .dimension = DIMENSION_ANGLE, .min = DEG(1e-6), .max = DEG(360), DEVICE(encoder.scale), .help = "Angle of one tick, e.g. 0.01deg."},
 	{GROUP_ENCODER, "zero", KEY_REAL, .preset = "0", DEVICE(encoder.zero), .help = "Ticks at angle 0."},
@@ -136,7 +221,8 @@ const struct key key_table[] = {
 };
 /* clang-format on */
 
-static const char *const driver_names[] = {"lms2xx", "modbus", "pose", "tim", "lms1xx", "lms5xx", NULL};
+static const char *const driver_names[] = {"lms2xx", "modbus", "pose",    "tim",      "lms1xx",
+                                           "lms5xx", "can",    "canopen", "odometry", NULL};
 
 unsigned keys_driver(const char *name)
 {

@@ -20,6 +20,16 @@ enum key_group {
 	GROUP_DEVICE,
 	GROUP_REGISTER,
 	GROUP_WRITE,
+	GROUP_UNTIL,
+	GROUP_STROBE,
+	GROUP_WATCHDOG,
+	GROUP_STATUS,
+	GROUP_SIGNAL,
+	GROUP_COUNTER,
+	GROUP_VALID,
+	GROUP_MUX,
+	GROUP_COUNT,
+	GROUP_HOMING,
 	GROUP_ENCODER,
 	GROUP_SWEEP,
 	GROUP_LISTEN,
@@ -43,22 +53,28 @@ enum key_type {
 	KEY_VECTOR,    /* [x, y, z]: three doubles */
 	KEY_TRANSFORM, /* {xyz, rpy} -> struct transform */
 	KEY_REGISTER,  /* a Modbus register map */
+	KEY_SIGNAL,    /* a number in a CAN frame */
 	KEY_TILT,      /* a device's name, or a fixed angle */
 	KEY_VARIANT,   /* FIELD_OF_VIEW/RESOLUTION in degrees */
 	KEY_MASKS,     /* a list of [from, to] */
-	KEY_WRITES     /* a list of {address, value} */
+	KEY_WRITES     /* a list of {address, value, ...} -> struct config_writes */
 };
 
 /* Drivers a key of a device belongs to. */
-#define KEY_LMS2XX  1u
-#define KEY_MODBUS  2u
-#define KEY_POSE    4u
-#define KEY_TIM     8u
-#define KEY_LMS1XX  16u
-#define KEY_LMS5XX  32u
-#define KEY_COLA    (KEY_TIM | KEY_LMS1XX | KEY_LMS5XX)
-#define KEY_SCANNER (KEY_LMS2XX | KEY_COLA)
-#define KEY_ALL     63u
+#define KEY_LMS2XX   1u
+#define KEY_MODBUS   2u
+#define KEY_POSE     4u
+#define KEY_TIM      8u
+#define KEY_LMS1XX   16u
+#define KEY_LMS5XX   32u
+#define KEY_CAN      64u
+#define KEY_CANOPEN  128u
+#define KEY_ODOMETRY 256u
+#define KEY_COLA     (KEY_TIM | KEY_LMS1XX | KEY_LMS5XX)
+#define KEY_SCANNER  (KEY_LMS2XX | KEY_COLA)
+#define KEY_ON_CAN   (KEY_CAN | KEY_CANOPEN | KEY_ODOMETRY)
+#define KEY_SERVO    (KEY_MODBUS | KEY_CANOPEN) /* those that can be commanded */
+#define KEY_ALL      511u
 
 struct key {
 	enum key_group group;

@@ -73,7 +73,7 @@ static void put_key(FILE *out, int indent, const struct key *key, bool brief)
 /* The parts of a value that is written in braces, once, before the first key that has them. */
 static void put_parts(FILE *out, int indent, const struct key *key, bool *described)
 {
-	if (!key->inner || key->inner == GROUP_WRITE || described[key->inner])
+	if (!key->inner || described[key->inner])
 		return;
 	described[key->inner] = true;
 	put_indent(out, indent);
@@ -105,13 +105,12 @@ static bool is_repeated(const struct key *key, unsigned driver)
 
 static void put_device(FILE *out, unsigned driver, bool *described)
 {
-	const char *name = driver == KEY_LMS2XX   ? "laser"
-	                   : driver == KEY_MODBUS ? "servo"
-	                   : driver == KEY_POSE   ? "pose"
-	                   : driver == KEY_TIM    ? "front"
-	                   : driver == KEY_LMS1XX ? "left"
-	                                          : "right";
-	fprintf(out, "\n  - name: %s\n    driver: %s\n", name, keys_driver_name(driver));
+	static const char *const names[] = {"laser", "servo", "pose",  "front", "left",
+	                                    "right", "angle", "drive", "wheels"};
+	int place = 0;
+	while (driver >> place > 1)
+		place++;
+	fprintf(out, "\n  - name: %s\n    driver: %s\n", names[place], keys_driver_name(driver));
 	for (const struct key *key = key_table; key->name; key++) {
 		if (key->group != GROUP_DEVICE || key->drivers == KEY_ALL || !(key->drivers & driver))
 			continue;
@@ -133,7 +132,7 @@ void keys_write_manual(FILE *out)
 		fprintf(out, "%s:\n", key->name);
 		if (key->type == KEY_GROUP)
 			put_group(out, key->inner, described);
-		for (unsigned driver = KEY_LMS2XX; key->type == KEY_DEVICES && driver <= KEY_LMS5XX; driver <<= 1)
+		for (unsigned driver = KEY_LMS2XX; key->type == KEY_DEVICES && driver & KEY_ALL; driver <<= 1)
 			put_device(out, driver, described);
 	}
 }

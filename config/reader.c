@@ -338,6 +338,43 @@ static int read_register(struct reader *r, const struct key *key, int at, struct
 	return 0;
 }
 
+/* Bits that a frame does not have are refused here, so that decoders need not ask. */
+static int judge_bits(struct reader *r, int at, const char *what, int start, int length, bool motorola)
+{
+	int last = start + length - 1;
+	if (motorola) /* down to bit 0 of this byte, then on from bit 7 of the next */
+		last = (start / 8 + (length - start % 8 - 1 + 7) / 8) * 8;
+	return last < 512 ? 0
+	                  : reader_fail(r, reader_line(r, at, what),
+	                                "%s.%s: bits beyond the 512 of the longest frame; check start and length",
+	                                r->path, what);
+}
+
+static int read_signal(struct reader *r, const struct key *key, int at, struct config_signal *to)
+{
+	struct config_signal signal = {.set = true};
+	int error = reader_group(r, key->inner, 0, at, &signal);
+	if (error)
+		return error;
+	const bool motorola = signal.order == SIGNAL_MOTOROLA;
+	if (!signal.extended && signal.id > 0x7ff)
+		return reader_fail(r, reader_line(r, at, "id"),
+		                   "%s.id: 0x%x has more than 11 bits; write `extended: on` beside it", r->path,
+		                   signal.id);
+	if (signal.type == SIGNAL_FLOAT && signal.length != 32 && signal.length != 64)
+		return reader_fail(r, reader_line(r, at, "length"), "%s.length: a float has 32 or 64 bits", r->path);
+	if (signal.scale == 0)
+		return reader_fail(r, reader_line(r, at, "scale"), "%s.scale: 0 makes everything 0", r->path);
+	error = judge_bits(r, at, "start", signal.start, signal.length, motorola);
+	if (!error && signal.counter.set)
+		error = judge_bits(r, at, "counter", signal.counter.start, signal.counter.length, motorola);
+	if (!error && signal.mux.set)
+		error = judge_bits(r, at, "mux", signal.mux.start, signal.mux.length, motorola);
+	if (!error)
+		*to = signal;
+	return error;
+}
+
 static int read_tilt(struct reader *r, const struct key *key, int at, struct config_device *device)
 {
 	const struct yaml_node *node = node_at(r, at);
@@ -382,7 +419,7 @@ static int read_masks(struct reader *r, const struct key *key, int at, struct co
 	return 0;
 }
 
-static int read_writes(struct reader *r, const struct key *key, int at, struct config_device *device)
+static int read_writes(struct reader *r, const struct key *key, int at, struct config_writes *to)
 {
 	const struct yaml_node *node = node_at(r, at);
 	int n = 0;
@@ -392,11 +429,11 @@ static int read_writes(struct reader *r, const struct key *key, int at, struct c
 		if (n == CONFIG_WRITES_MAX)
 			return reader_fail(r, node_at(r, child)->line, "%s: at most %d are possible", r->path,
 			                   CONFIG_WRITES_MAX);
-		const int error = reader_group(r, key->inner, 0, child, &device->write[n]);
+		const int error = reader_group(r, key->inner, 0, child, &to->item[n]);
 		if (error)
 			return error;
 	}
-	device->writes = n;
+	to->n = n;
 	return 0;
 }
 
@@ -481,7 +518,9 @@ static int read_value(struct reader *r, const struct key *key, int at, void *bas
 	case KEY_MASKS:
 		return read_masks(r, key, at, base);
 	case KEY_WRITES:
-		return read_writes(r, key, at, base);
+		return read_writes(r, key, at, to);
+	case KEY_SIGNAL:
+		return read_signal(r, key, at, to);
 	}
 	return -EINVAL;
 }

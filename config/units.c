@@ -6,11 +6,13 @@
 
 #include <errno.h>
 #include <math.h>
+#include <stdbool.h>
 #include <stdio.h>
 #include <stdlib.h>
 #include <string.h>
 
 #define NUMBER_MAX 64 /* characters of a number: longer ones are no numbers */
+#define HEX        "0123456789abcdefABCDEF"
 #define DEGREE     0.017453292519943295
 
 struct suffix {
@@ -18,12 +20,23 @@ struct suffix {
 	double factor;
 };
 
-static const struct suffix suffixes[DIMENSIONS][10] = {
+static const struct suffix suffixes[DIMENSIONS][12] = {
     [DIMENSION_NONE] = {{"G", 1e9}, {"M", 1e6}, {"k", 1e3}, {"", 1}},
     [DIMENSION_LENGTH] = {{"m", 1}, {"cm", 0.01}, {"mm", 0.001}, {"", 1}},
     [DIMENSION_ANGLE] = {{"deg", DEGREE}, {"rad", 1}, {"mrad", 0.001}, {"", 1}},
     [DIMENSION_TIME] = {{"h", 3600}, {"min", 60}, {"s", 1}, {"ms", 1e-3}, {"us", 1e-6}, {"ns", 1e-9}, {"", 1}},
     [DIMENSION_RATE] = {{"deg/s", DEGREE}, {"rad/s", 1}, {"deg", DEGREE}, {"rad", 1}, {"", 1}},
+    [DIMENSION_SIGNAL] = {{"deg", DEGREE},
+                          {"m", 1},
+                          {"deg/s", DEGREE},
+                          {"m/s", 1},
+                          {"cm", 0.01},
+                          {"mm", 0.001},
+                          {"mm/s", 0.001},
+                          {"rad", 1},
+                          {"mrad", 0.001},
+                          {"rad/s", 1},
+                          {"", 1}},
     [DIMENSION_FREQUENCY] = {{"Hz", 1}, {"", 1}},
     [DIMENSION_BYTES] = {{"G", 1073741824.0}, {"M", 1048576.0}, {"k", 1024.0}, {"", 1}},
 };
@@ -32,7 +45,7 @@ static const char *const lists[DIMENSIONS] = {
     [DIMENSION_NONE] = "k, M, G",         [DIMENSION_LENGTH] = "m, cm, mm",
     [DIMENSION_ANGLE] = "deg, rad, mrad", [DIMENSION_TIME] = "h, min, s, ms, us, ns",
     [DIMENSION_RATE] = "deg/s, rad/s",    [DIMENSION_BYTES] = "k, M, G",
-    [DIMENSION_FREQUENCY] = "Hz",
+    [DIMENSION_FREQUENCY] = "Hz",         [DIMENSION_SIGNAL] = "deg, deg/s, rad, rad/s, m, m/s, mm, mm/s",
 };
 
 static size_t digits(const char *text)
@@ -70,10 +83,23 @@ static const struct suffix *find_suffix(const char *text, enum dimension dimensi
 	return NULL;
 }
 
+/* Registers, masks and identifiers are written as their handbooks do: 0x181. */
+static bool parse_hex(const char *text, double *ret)
+{
+	const size_t n = text[0] == '0' && (text[1] == 'x' || text[1] == 'X') ? strspn(text + 2, HEX) : 0;
+
+	if (n == 0 || n > 8 || text[2 + n])
+		return false;
+	*ret = (double)strtoul(text + 2, NULL, 16);
+	return true;
+}
+
 int units_parse(const char *text, enum dimension dimension, double *ret)
 {
 	char copy[NUMBER_MAX];
 	size_t n = number_length(text);
+	if (dimension == DIMENSION_NONE && parse_hex(text, ret))
+		return 0;
 	if (n == 0 || n >= sizeof(copy))
 		return -EINVAL;
 	memcpy(copy, text, n);

@@ -5,13 +5,14 @@
 #include <stddef.h>
 
 enum dimension {
-	DIMENSION_NONE, /* k, M, G are powers of 1000 */
+	DIMENSION_NONE, /* k, M, G are powers of 1000; also 0x1F */
 	DIMENSION_LENGTH,
 	DIMENSION_ANGLE,
 	DIMENSION_TIME,
 	DIMENSION_RATE, /* rad/s; `30deg` is read as 30deg/s */
 	DIMENSION_FREQUENCY,
-	DIMENSION_BYTES, /* k, M, G are powers of 1024 */
+	DIMENSION_SIGNAL, /* of a CAN signal: angle, way, or either per second */
+	DIMENSION_BYTES,  /* k, M, G are powers of 1024 */
 	DIMENSIONS
 };
 

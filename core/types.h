@@ -54,6 +54,16 @@ struct pose {
 	int64_t t_ns;
 	struct vec3 position_m;
 	struct quat rotation;
+	double variance_m2,
+	    variance_rad2; /* of the position along any axis, of the direction; 0: not known, or exact */
+	/* The map was moved under the robot (a loop was closed elsewhere): nothing lies between the pose before and this. */
+	bool jumped;
+};
+
+/* A piece of the robot's way, as its wheels tell it: from `from_ns` to `t_ns`. Decoder -> the robot's track. */
+struct motion {
+	int64_t from_ns, t_ns;
+	double ahead_m, turn_rad; /* in the base frame; positive to the left */
 };
 
 /* One beam of a row, in the map frame. */

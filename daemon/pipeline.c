@@ -198,7 +198,7 @@ static void advance(struct pipeline *p, bool end)
 
 void pipeline_handle(struct pipeline *p, const struct record *record)
 {
-	const struct record_sink found = {p, on_profile, on_tilt, on_pose, on_reply};
+	const struct record_sink found = {p, on_profile, on_tilt, on_pose, on_reply, NULL};
 	struct device *device;
 
 	assert(record->device >= 0 && record->device < p->config->devices);

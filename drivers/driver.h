@@ -45,7 +45,8 @@ struct record_sink {
 	void (*profile)(void *ctx, int device, const struct profile *);
 	void (*tilt)(void *ctx, int device, const struct tilt *);
 	void (*pose)(void *ctx, int device, const struct pose *);
-	void (*reply)(void *ctx, int device, const struct reply *); /* may be NULL (replay) */
+	void (*reply)(void *ctx, int device, const struct reply *);   /* may be NULL (replay) */
+	void (*motion)(void *ctx, int device, const struct motion *); /* may be NULL */
 };
 
 /* Verdicts of a decoder, by reason: counted, never logged per event. Names say the reason. */
@@ -70,7 +71,7 @@ struct decoder_timing {
 	double drift_ppm;  /* of the device's clock against the host's: positive runs fast */
 };
 
-enum device_role { ROLE_LASER, ROLE_TILT, ROLE_POSE };
+enum device_role { ROLE_LASER, ROLE_TILT, ROLE_POSE, ROLE_MOTION };
 
 #define DIALOGUE_WRITE_MAX 256
 

@@ -299,7 +299,7 @@ static bool is_silent(struct dialogue *d, int64_t t_ns)
 /* Decides, from the angles seen so far, what is to be written next. */
 static void look(struct dialogue *d, int64_t t_ns)
 {
-	if (d->phase == WRITING && d->next_write == d->device.writes)
+	if (d->phase == WRITING && d->next_write == d->device.write.n)
 		d->phase = RUNNING;
 	if (d->phase != RUNNING && d->phase != STOPPING)
 		return;
@@ -325,7 +325,7 @@ static void look(struct dialogue *d, int64_t t_ns)
 static enum wish choose(struct dialogue *d)
 {
 	if (d->phase == WRITING)
-		return d->next_write < d->device.writes ? WISH_INITIAL : WISH_NONE;
+		return d->next_write < d->device.write.n ? WISH_INITIAL : WISH_NONE;
 	if (d->speed_due) {
 		d->speed_due = false;
 		return WISH_SPEED;
@@ -344,9 +344,9 @@ static int value_of(const struct dialogue *d, struct modbus_transaction *t)
 	int error;
 
 	if (d->waiting == WISH_INITIAL) {
-		t->address = modbus_wire_address(&d->device, d->device.write[d->next_write].address);
+		t->address = modbus_wire_address(&d->device, d->device.write.item[d->next_write].address);
 		t->n = 1;
-		t->value[0] = d->device.write[d->next_write].value;
+		t->value[0] = d->device.write.item[d->next_write].value;
 		t->function = 6;
 		return 0;
 	}

@@ -23,7 +23,7 @@ static void check_device(const struct config *config, int i)
 	must(keys_driver(device->driver) != 0);
 	must(device->name[0] && memchr(device->name, '\0', sizeof(device->name)));
 	must(device->masks >= 0 && device->masks <= SWEEP_MASKS_MAX);
-	must(device->writes >= 0 && device->writes <= CONFIG_WRITES_MAX);
+	must(device->write.n >= 0 && device->write.n <= CONFIG_WRITES_MAX);
 	if (keys_driver(device->driver) == KEY_LMS2XX)
 		must(device->range_min_m < device->range_max_m && device->port[0]);
 	if (keys_driver(device->driver) == KEY_MODBUS)

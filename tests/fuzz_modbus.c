@@ -57,7 +57,7 @@ static struct config config_of(uint8_t how, uint8_t sweep)
 	config.sweep.speed_rad_s = 0.05;
 	config.sweep.profile = (sweep >> 1 & 3) % 3;
 	config.sweep.step_rad = sweep & 8 ? 0.0 : 0.03;
-	d->writes = sweep & 16 ? 2 : 0;
+	d->write.n = sweep & 16 ? 2 : 0;
 	d->target.set = !(sweep & 32);
 	d->speed.set = !(sweep & 64);
 	config.sweep.has_rest = sweep & 128;

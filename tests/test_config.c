@@ -125,9 +125,9 @@ static void every_value_of_a_device_arrives(void **state)
 	assert_int_equal(servo->position.sign, -1);
 	assert_int_equal(servo->target.function, 6);
 	assert_int_equal(servo->speed.function, 16);
-	assert_int_equal(servo->writes, 2);
-	assert_int_equal(servo->write[1].address, 17);
-	assert_int_equal(servo->write[1].value, 255);
+	assert_int_equal(servo->write.n, 2);
+	assert_int_equal(servo->write.item[1].address, 17);
+	assert_int_equal(servo->write.item[1].value, 255);
 	assert_string_equal(c.device[2].listen, "udp:127.0.0.1:9000");
 }
 
@@ -590,7 +590,7 @@ static void only_who_has_an_encoder_or_a_servo_tilts(void **state)
 	               "f.yaml:1: devices[0].encoder.wrap", "outside");
 	assert_refused("devices: [{name: a, driver: lms5xx, connect: 10.0.0.1, encoder: {scale: 1deg}}]\n"
 	               "sweep: {device: a}",
-	               "f.yaml:2: sweep.device", "no `target` register");
+	               "f.yaml:2: sweep.device", "only tells its angle");
 }
 
 static void values_of_a_scanner_out_of_range_are_refused(void **state)
@@ -666,7 +666,7 @@ static void the_manual_is_a_configuration_and_names_every_key(void **state)
 	struct config_error error;
 	if (config_read(text, len, "config/facetd.yaml", &c, &error))
 		fail_msg("%s", error.text);
-	assert_int_equal(c.devices, 6); /* one of each driver */
+	assert_int_equal(c.devices, 9); /* one of each driver */
 	assert_true(c.sweep.set);
 	for (const struct key *key = key_table; key->name; key++) {
 		snprintf(word, sizeof(word), "%s:", key->name);

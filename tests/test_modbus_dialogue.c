@@ -189,9 +189,9 @@ static void initial_writes_come_first_and_again_after_a_reset(void **state)
 	int64_t t_ns = 0;
 
 	(void)state;
-	config.device[0].writes = 2;
-	config.device[0].write[0].address = 10;
-	config.device[0].write[1].address = 11;
+	config.device[0].write.n = 2;
+	config.device[0].write.item[0].address = 10;
+	config.device[0].write.item[1].address = 11;
 	d = driver_modbus.dialogue_create(&config, 0);
 	driver_modbus.dialogue_reset(d, t_ns);
 	driver_modbus.dialogue_step(d, t_ns, &step);

@@ -321,7 +321,8 @@ static void seeds_of_sweep(const char *dir, bool fixed)
 
 		for (int i = 0; i < n; i++) {
 			sweep_tilt(sweep, &(struct tilt){t_ns + i * SESSION_STEP_NS, 0.01 * i});
-			sweep_pose(sweep, &(struct pose){t_ns + i * SESSION_STEP_NS, {0.01 * i, 0, 0}, {1, 0, 0, 0}});
+			sweep_pose(sweep, &(struct pose){
+			                      t_ns + i * SESSION_STEP_NS, {0.01 * i, 0, 0}, {1, 0, 0, 0}, 0, 0, false});
 		}
 		for (int i = 0; i < n; i++)
 			sweep_profile(sweep,

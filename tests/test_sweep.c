@@ -66,7 +66,7 @@ static void add_tilt(struct sweep *s, int64_t t_ns, double rad)
 
 static void add_pose(struct sweep *s, int64_t t_ns, double x_m)
 {
-	sweep_pose(s, &(struct pose){t_ns, {x_m, 0, 0}, {1, 0, 0, 0}});
+	sweep_pose(s, &(struct pose){t_ns, {x_m, 0, 0}, {1, 0, 0, 0}, 0, 0, false});
 }
 
 static struct row *expect_row(struct sweep *s, int64_t log_ns)
@@ -451,8 +451,8 @@ static void the_pose_goes_on_for_50_ms_with_its_last_twist(void **state)
 		int64_t newest = last - 50 * MS - late;
 		struct profile *p = make_profile(100 * MS, 1, 5);
 		double yaw = 0.01; /* rad in the last 10 ms */
-		sweep_pose(s, &(struct pose){newest - 10 * MS, {1, 0, 0}, {1, 0, 0, 0}});
-		sweep_pose(s, &(struct pose){newest, {1.02, 0, 0}, {cos(yaw / 2), 0, 0, sin(yaw / 2)}});
+		sweep_pose(s, &(struct pose){newest - 10 * MS, {1, 0, 0}, {1, 0, 0, 0}, 0, 0, false});
+		sweep_pose(s, &(struct pose){newest, {1.02, 0, 0}, {cos(yaw / 2), 0, 0, sin(yaw / 2)}, 0, 0, false});
 		sweep_profile(s, p, 110 * MS);
 		if (late) {
 			expect_drop(s, 140 * MS, SWEEP_STALE_POSE);

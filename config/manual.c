@@ -81,6 +81,9 @@ static void put_parts(FILE *out, int indent, const struct key *key, bool *descri
 	for (const struct key *part = key_table; part->name; part++)
 		if (part->group == key->inner)
 			describe(out, indent, part, part->name);
+	for (const struct key *part = key_table; part->name; part++)
+		if (part->group == key->inner)
+			put_parts(out, indent, part, described);
 }
 
 static void put_group(FILE *out, enum key_group group, bool *described)

@@ -162,7 +162,7 @@ static void an_unknown_key_names_its_line_and_the_nearest_key(void **state)
 	assert_refused("devices:\n- name: a\n  driver: lms2xx\n  prot: x\n",
 	               "f.yaml:4: unknown key 'prot' in devices[0]", "'port'");
 	assert_refused("devices:\n- {name: a, driver: lms2xx, port: x, connect: y}\n", "f.yaml:2: devices[0]",
-	               "a key of modbus, tim, lms1xx, lms5xx, not of lms2xx");
+	               "a key of modbus, tim, lms1xx, lms5xx, can, canopen, odometry, not of lms2xx");
 }
 
 static void a_value_out_of_range_names_the_range(void **state)
@@ -593,6 +593,120 @@ static void only_who_has_an_encoder_or_a_servo_tilts(void **state)
 	               "f.yaml:2: sweep.device", "only tells its angle");
 }
 
+#define SIGNAL_DEVICE(parts) "devices: [{name: a, driver: can, connect: can0, angle: {" parts "}}]"
+static void a_signal_of_a_can_frame_is_read_as_a_dbc_file_has_it(void **state)
+{
+	(void)state;
+	struct config c;
+	struct config_error error;
+	if (read_text(
+	        SIGNAL_DEVICE("id: 0x18ff0001, extended: on, start: 7, length: 16, order: motorola, scale: -0.01deg, "
+	                      "offset: 90deg, counter: {start: 63, length: 8}, valid: {bit: 48}, "
+	                      "mux: {start: 23, length: 8, value: 3}"),
+	        &c, &error))
+		fail_msg("%s", error.text);
+	const struct config_signal *s = &c.device[0].angle;
+	assert_true(s->set && s->extended && s->counter.set && s->valid.set && s->mux.set);
+	assert_int_equal(s->id, 0x18ff0001);
+	assert_int_equal(s->order, SIGNAL_MOTOROLA);
+	assert_int_equal(s->type, SIGNAL_SIGNED);
+	assert_near(s->scale, -0.01 * DEG, 1e-12);
+	assert_near(s->offset, 90 * DEG, 1e-12);
+	assert_int_equal(s->valid.value, 1);
+	assert_int_equal(s->mux.value, 3);
+	assert_int_equal(c.device[0].timeout_ns, 500000000);
+}
+
+static void a_signal_that_no_frame_can_hold_is_refused(void **state)
+{
+	(void)state;
+	static const struct {
+		const char *text, *sentence;
+	} bad[] = {
+	    {SIGNAL_DEVICE("id: 0x800, scale: 1deg"), "more than 11 bits"},
+	    {SIGNAL_DEVICE("id: 0x7fg, scale: 1deg"), "'0x7fg'"},
+	    {SIGNAL_DEVICE("id: 1, scale: 0"), "makes everything 0"},
+	    {SIGNAL_DEVICE("id: 1"), "`scale` is missing"},
+	    {SIGNAL_DEVICE("id: 1, scale: 1deg, start: 500, length: 16"), "beyond the 512"},
+	    {SIGNAL_DEVICE("id: 1, scale: 1deg, start: 511, length: 9, order: motorola"), "beyond the 512"},
+	    {SIGNAL_DEVICE("id: 1, scale: 1deg, type: float"), "32 or 64 bits"},
+	    {SIGNAL_DEVICE("id: 1, scale: 1deg, counter: {start: 505, length: 8}"), "beyond the 512"},
+	    {SIGNAL_DEVICE("id: 1, scale: 1deg, mux: {start: 0, length: 8}"), "`value` is missing"},
+	};
+	for (size_t i = 0; i < sizeof(bad) / sizeof(bad[0]); i++)
+		assert_refused(bad[i].text, "f.yaml:1: devices[0].angle", bad[i].sentence);
+	struct config c;
+	struct config_error error; /* the last bit of the longest frame, either way */
+	assert_int_equal(read_text(SIGNAL_DEVICE("id: 1, scale: 1deg, start: 496, length: 16"), &c, &error), 0);
+	assert_int_equal(
+	    read_text(SIGNAL_DEVICE("id: 1, scale: 1deg, start: 511, length: 8, order: motorola"), &c, &error), 0);
+}
+
+static void a_bus_is_shared_by_those_who_can(void **state)
+{
+	(void)state;
+	static const char modbus[] = "{name: %s, driver: modbus, connect: /dev/s, unit: %d, baud: %d, "
+	                             "position: {address: 0, scale: 1deg}}";
+	static const char drive[] = "{name: %s, driver: canopen, connect: can0, node: %d, sync: %s}";
+	char one[300], other[300], text[700];
+	struct config c;
+	struct config_error error;
+	snprintf(one, sizeof(one), modbus, "a", 1, 19200);
+	snprintf(other, sizeof(other), modbus, "b", 2, 19200);
+	snprintf(text, sizeof(text), "devices: [%s, %s]", one, other);
+	assert_int_equal(read_text(text, &c, &error), 0);
+	snprintf(other, sizeof(other), modbus, "b", 1, 19200);
+	snprintf(text, sizeof(text), "devices: [%s, %s]", one, other);
+	assert_refused(text, "f.yaml:1: devices[1]", "already the line of 'a'");
+	snprintf(other, sizeof(other), modbus, "b", 2, 9600);
+	snprintf(text, sizeof(text), "devices: [%s, %s]", one, other);
+	assert_refused(text, "f.yaml:1: devices[1]", "already the line of 'a'");
+	snprintf(one, sizeof(one), drive, "a", 4, "10ms");
+	snprintf(other, sizeof(other), drive, "b", 5, "0");
+	snprintf(text, sizeof(text), "devices: [%s, %s]", one, other);
+	assert_int_equal(read_text(text, &c, &error), 0);
+	snprintf(other, sizeof(other), drive, "b", 5, "5ms");
+	snprintf(text, sizeof(text), "devices: [%s, %s]", one, other);
+	assert_refused(text, "f.yaml:1: devices[1].sync", "already sends SYNC");
+	snprintf(other, sizeof(other), drive, "b", 4, "0");
+	snprintf(text, sizeof(text), "devices: [%s, %s]", one, other);
+	assert_refused(text, "f.yaml:1: devices[1].node", "already the node of 'a'");
+}
+
+static void servos_and_wheels_that_make_no_sense_are_refused(void **state)
+{
+	(void)state;
+	static const char drive[] = "devices: [{name: d, driver: canopen, connect: can0, node: 5, scale: 1deg, "
+	                            "limits: [-50deg, 50deg]%s}]\nsweep: {device: d, from: %s, to: 45deg%s}";
+	char text[600];
+	struct config c;
+	struct config_error error;
+	snprintf(text, sizeof(text), drive, "", "-45deg", ", rest: 0deg");
+	assert_int_equal(read_text(text, &c, &error), 0);
+	snprintf(text, sizeof(text), drive, "", "-51deg", "");
+	assert_refused(text, "f.yaml:2: sweep.from", "outside the limits of 'd'");
+	snprintf(text, sizeof(text), drive, "", "-45deg", ", rest: 60deg");
+	assert_refused(text, "f.yaml:2: sweep.rest", "outside the limits of 'd'");
+	snprintf(text, sizeof(text), drive, ", kind: encoder", "-45deg", "");
+	assert_refused(text, "f.yaml:2: sweep.device", "only tells its angle");
+	snprintf(text, sizeof(text), drive, ", master: 5", "-45deg", "");
+	assert_refused(text, "f.yaml:1: devices[0].node", "our own id");
+	assert_refused("devices: [{name: a, driver: canopen, connect: can0, node: 5, kind: drive}]",
+	               "f.yaml:1: devices[0]", "`scale` is missing");
+	assert_refused("devices: [{name: a, driver: canopen, connect: /dev/can0, node: 5}]",
+	               "f.yaml:1: devices[0].connect", "no CAN interface");
+	assert_refused("devices: [{name: a, driver: canopen, connect: an_interface_that_is_long, node: 5}]",
+	               "f.yaml:1: devices[0].connect", "no CAN interface");
+	assert_refused("devices: [{name: a, driver: odometry, connect: can0}]", "f.yaml:1: devices[0]",
+	               "either `speed` and `turn`, or");
+	assert_refused(
+	    "devices: [{name: a, driver: odometry, connect: can0, speed: {id: 1, scale: 1}, left: {id: 2, scale: 1}}]",
+	    "f.yaml:1: devices[0]", "either `speed` and `turn`, or");
+	assert_refused("devices: [{name: a, driver: odometry, connect: can0, right: {id: 1, scale: 1mm}, "
+	               "left: {id: 2, scale: 1mm}}]",
+	               "f.yaml:1: devices[0].track", "between the wheels");
+}
+
 static void values_of_a_scanner_out_of_range_are_refused(void **state)
 {
 	(void)state;
@@ -714,6 +828,10 @@ int main(int argc, char **argv)
 	    cmocka_unit_test(a_scanner_is_connected_in_a_way_it_has),
 	    cmocka_unit_test(two_scanners_have_two_lines),
 	    cmocka_unit_test(only_who_has_an_encoder_or_a_servo_tilts),
+	    cmocka_unit_test(a_signal_of_a_can_frame_is_read_as_a_dbc_file_has_it),
+	    cmocka_unit_test(a_signal_that_no_frame_can_hold_is_refused),
+	    cmocka_unit_test(a_bus_is_shared_by_those_who_can),
+	    cmocka_unit_test(servos_and_wheels_that_make_no_sense_are_refused),
 	    cmocka_unit_test(values_of_a_scanner_out_of_range_are_refused),
 	    cmocka_unit_test(the_scanner_gets_its_mount_masks_and_pose),
 	    cmocka_unit_test(the_manual_in_the_repository_is_the_tables),

@@ -40,6 +40,28 @@ enum scenario_laser { SCENARIO_LMS2XX, SCENARIO_TIM, SCENARIO_LMS1XX, SCENARIO_L
 /* By its driver's name, "lms2xx"; SCENARIO_LASERS: there is none. */
 enum scenario_laser scenario_laser(const char *driver);
 
+/* Which servo tilts it, and who commands it. */
+enum scenario_servo {
+	SCENARIO_MODBUS,           /* RTU on a pseudo-terminal */
+	SCENARIO_MODBUS_TCP,       /* on 127.0.0.1 */
+	SCENARIO_CAN,              /* moves by itself; its angle in a frame */
+	SCENARIO_CANOPEN,          /* CiA 402, profile position */
+	SCENARIO_CANOPEN_CYCLIC,   /* ... cyclic synchronous position */
+	SCENARIO_CANOPEN_VELOCITY, /* ... profile velocity */
+	SCENARIO_CAN_ENCODER,      /* CiA 406, on a servo that moves by itself */
+	SCENARIO_INCLINOMETER,     /* CiA 410, the same */
+	SCENARIO_FIXED,            /* none */
+	SCENARIO_SERVOS
+};
+/* By its word of the command line, "canopen-cyclic"; SCENARIO_SERVOS: there is none. */
+enum scenario_servo scenario_servo(const char *word);
+
+/* `truth`: where the axis truly was, as text, a line a millisecond, written while it runs:
+ *
+ *   T ANGLE X Y Z YAW
+ *
+ * T CLOCK_REALTIME in ns; ANGLE of the tilt axis in rad, positive looks down, as facetd means it; then the robot in the map,
+ * m and rad. Between two lines a straight line is right to 0.0001 degree. */
 struct scenario_params {
 	const char *name;  /* "building", "hall", "uos:DIR", "profiles:FILE.csv" */
 	char *const *more; /* further profile files */

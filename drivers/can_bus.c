@@ -76,9 +76,9 @@ void can_bus_sentence(enum can_bus_health health, const char *interface, char re
 
 	ret[0] = '\0';
 	if (health == CAN_BUS_WARNING)
-		snprintf(ret, 160, "%.40s: the controller warns of many errors: %s", interface, check);
+		snprintf(ret, 160, "%.30s: the controller warns of many errors: %s", interface, check);
 	else if (health == CAN_BUS_PASSIVE)
-		snprintf(ret, 160, "%.40s: error passive, frames fail; is anybody else there? If so, %s", interface,
+		snprintf(ret, 160, "%.30s: error passive, frames fail; is anybody else there? If so, %s", interface,
 		         check);
 	else if (health == CAN_BUS_OFF)
 		snprintf(ret, 160, "%.15s: bus-off: %s; `ip link set %.15s type can restart` starts it again",

@@ -18,7 +18,7 @@ struct sim_can_angle_params {
 };
 int sim_can_angle_create(const struct sim_can_angle_params *, int64_t t_ns, struct sim_device *ret); /* 0 or -ENOMEM */
 
-/* Faults: "silence"; "slip": wheels turn further than the robot goes, by this share (0.2); "stuck": the left wheel stands;
+/* Faults: "silence"; "slip": wheels turn further than the robot goes, by this share (0.2); "blocked": the left wheel stands;
  * "power": off so long, then its counts begin at 0; "gap", "short", "invalid", "wrong id" as above. */
 struct sim_can_wheels_params {
 	/* Either `ahead` and `turn` (of one frame or of two), or `left` and `right`: what the wheels' encoders count. */

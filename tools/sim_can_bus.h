@@ -25,14 +25,14 @@
  *   "errors"     so many bus errors a second (1000), each an error frame
  *   "no ack"     error frames without an acknowledgement, once or a hundred a second
  *   "drop"       share of the frames that get lost, each way (1)
- *   "late"       frames arrive so many ms after they were on the bus, each way (20)
+ *   "late"       what nodes send arrives so many ms after it was on the bus (20)
  *   "rtr", "extended", "fd"   every frame of a brain is followed by a twin: a request for it; the same number as an id of
  *                29 bits, with other data; the same as an FD frame of 64 bytes
  *   "full"       hub: what clients send is not taken, until their sockets have no more room
  *   "down", "deleted"   hub: clients are closed and refused; the socket's file is gone as well */
 struct sim_can_bus_params {
-	const char *path;      /* of the hub's socket; replaced when nobody listens on it. NULL: none */
-	const char *interface; /* NULL: none. It is never configured here */
+	const char *path;      /* of the hub's socket; replaced when nobody listens on it. NULL: ... */
+	const char *interface; /* ... nodes on this one; it is never configured here */
 	uint64_t seed;
 };
 

@@ -15,11 +15,13 @@
 #define FACET_DRIVERS_SWEEPER_H
 
 #include "config/config.h"
+#include "drivers/leg.h"
 
 enum sweeper_state {
 	SWEEPER_RUNS,
-	SWEEPER_HALTED, /* what was wrong is `why`; the driver stops the servo by its own means, if it has any */
-	SWEEPER_DONE    /* after sweeper_stop: it stands at the rest angle, or has had the time for it */
+	/* What was wrong is `why`. A servo that cannot be stopped otherwise is sent one last target, where it stands. */
+	SWEEPER_HALTED,
+	SWEEPER_DONE /* after sweeper_stop: it stands at the rest angle, or has had the time for it */
 };
 
 struct sweeper_wish {
@@ -57,24 +59,20 @@ struct sweeper {
 	double angle_rad, still_rad;
 	int64_t angle_ns, still_ns; /* it has stood near still_rad since still_ns */
 
-	/* The target it has taken, and where it should be by now: between a slow servo and a fast one. */
+	/* The target it has taken, and between where a slow servo would be by now and a fast one. */
 	bool told;
-	int64_t told_ns, taken_ns; /* first taken; last taken, by a nudge */
+	int64_t taken_ns;
 	int nudges;
-	double start_rad;                      /* where it stood when it took it */
-	double slow_rad, slow_rad_s, fast_rad; /* on its way, and at what speed */
-	double model_rad_s;                    /* the speed that was taken */
+	double start_rad; /* where it stood when it took it */
+	double slow_rad, slow_rad_s, fast_rad;
+	double model_rad_s; /* the speed that it has taken */
 	int64_t model_ns;
 
-	/* Cyclic: the trajectory is made of legs, in a time of its own that never makes large steps. */
+	/* Cyclic: the way, in a time of its own that makes no large steps. */
 	bool planned;
 	int64_t clock_ns; /* of the last set-point */
-	double tau_s;     /* the trajectory's time */
-	struct sweeper_leg {
-		enum { LEG_HOLD, LEG_RAMPS, LEG_SINUS, LEG_BRAKE } kind;
-		double from_rad, to_rad, peak_rad_s, acceleration_rad_s2;
-		double begun_s, lasts_s;
-	} leg;
+	double leg_s;     /* since the leg began */
+	struct leg leg;
 	double setpoint_rad, setpoint_rad_s;
 };
 

@@ -26,9 +26,11 @@
 #include <syslog.h>
 
 #define READ_BYTES 4096
-#define STEPS_MAX  16           /* of a dialogue in one turn */
-#define FLAPS_TOLD 3            /* short streams that are told; who goes on so is told when it lasts */
-#define BLOCKED_NS 2000000000ll /* a device that takes no bytes for so long is lost */
+#define STEPS_MAX  16            /* of a dialogue in one turn */
+#define FLAPS_TOLD 3             /* short streams that are told; who goes on so is told when it lasts */
+#define BLOCKED_NS 2000000000ll  /* a device that takes no bytes for so long is lost */
+#define NOTES_MAX  6             /* changes of a note that are told within ... */
+#define NOTES_NS   60000000000ll /* ... a minute; the status has them all */
 
 struct line {
 	const struct driver *driver;
@@ -53,6 +55,9 @@ struct line {
 	bool untold;      /* it streams, and nobody was told */
 	char logged[160]; /* the failure that was logged last; empty since it streamed */
 	char noted[328];  /* the note that was logged last */
+	char remark[160]; /* of the link: a part of every note while it is open */
+	int notes;        /* logged within this minute, begun at `notes_ns` */
+	int64_t notes_ns;
 };
 
 struct supervisor {
@@ -102,31 +107,53 @@ static void close_line(struct supervisor *s, struct line *line, enum supervisor_
 	set_state(line, state, t_ns);
 }
 
-static void tell_streaming(struct supervisor *s, struct line *line)
+/* A device in trouble may change its note many times a second; the one that lasts is told when the minute is over. */
+static void tell_note(struct supervisor *s, struct line *line, bool at_begin, int64_t t_ns)
+{
+	const char *note = line->status.note;
+
+	if (strcmp(line->noted, note) == 0)
+		return;
+	if (t_ns - line->notes_ns >= NOTES_NS) {
+		line->notes_ns = t_ns;
+		line->notes = 0;
+	}
+	if (!at_begin && ++line->notes > NOTES_MAX)
+		return;
+	if (note[0])
+		log_device(s, line, LOG_NOTICE, note);
+	else if (!at_begin)
+		log_device(s, line, LOG_INFO, "in order again");
+	snprintf(line->noted, sizeof(line->noted), "%s", note);
+}
+
+static void tell_streaming(struct supervisor *s, struct line *line, int64_t t_ns)
 {
 	line->untold = false;
 	line->logged[0] = 0;
 	log_device(s, line, LOG_INFO, "streaming");
-	if (line->status.note[0] && strcmp(line->noted, line->status.note) != 0)
-		log_device(s, line, LOG_NOTICE, line->status.note);
-	snprintf(line->noted, sizeof(line->noted), "%s", line->status.note);
+	tell_note(s, line, true, t_ns);
 }
 
-/* `note`: of the dialogue, what is not as it was wanted; the link may have something to say, too. */
+/* `note`: of the dialogue, what is not as it was wanted; the link may have something to say, too. The dialogue's may change
+ * while it streams. */
 static void begin_streaming(struct supervisor *s, struct line *line, const char *note, int64_t t_ns)
 {
-	char more[160] = "";
+	const bool begins = line->status.state != SUPERVISOR_STREAMING;
 
-	if (line->status.state == SUPERVISOR_STREAMING)
-		return;
-	set_state(line, SUPERVISOR_STREAMING, t_ns);
-	line->status.error[0] = 0;
-	if (line->link && line->driver->link_note)
-		line->driver->link_note(line->link, more);
-	snprintf(line->status.note, sizeof(line->status.note), "%s%s%s", note, note[0] && more[0] ? "; " : "", more);
-	line->untold = line->flaps >= FLAPS_TOLD;
-	if (!line->untold)
-		tell_streaming(s, line);
+	if (begins) {
+		set_state(line, SUPERVISOR_STREAMING, t_ns);
+		line->status.error[0] = line->remark[0] = 0;
+		if (line->link && line->driver->link_note)
+			line->driver->link_note(line->link, line->remark);
+		line->untold = line->flaps >= FLAPS_TOLD;
+	}
+	snprintf(line->status.note, sizeof(line->status.note), "%s%s%s", note, note[0] && line->remark[0] ? "; " : "",
+	         line->remark);
+	if (begins && !line->untold)
+		tell_streaming(s, line, t_ns);
+	else if (!line->untold)
+		tell_note(s, line, false, t_ns);
 }
 
 /* The stream, if there was one, is over; what comes next is said, unless that was said already. */
@@ -136,7 +163,7 @@ static void leave(struct supervisor *s, struct line *line, const char *why, cons
 	bool steady = streamed && t_ns - line->status.since_ns >= SUPERVISOR_STEADY_NS;
 
 	if (steady && line->untold)
-		tell_streaming(s, line);
+		tell_streaming(s, line, t_ns);
 	told = streamed && !line->untold;
 	if (streamed)
 		line->flaps = steady ? 0 : line->flaps + 1;
@@ -463,7 +490,7 @@ void supervisor_timer(struct supervisor *s, int64_t t_ns)
 		if (line->paused && t_ns >= line->resume_ns)
 			resume(s, line);
 		if (line->untold && t_ns - line->status.since_ns >= SUPERVISOR_STEADY_NS)
-			tell_streaming(s, line);
+			tell_streaming(s, line, t_ns);
 		if (line->status.state == SUPERVISOR_BACKING_OFF)
 			open_line(s, line, t_ns);
 		else if (line->link)

@@ -84,7 +84,7 @@ struct dialogue_step {
 	int64_t deadline_ns; /* call again at the latest then; INT64_MAX: only on a reply */
 	enum dialogue_state { DIALOGUE_CONFIGURING, DIALOGUE_STREAMING, DIALOGUE_FAILED } state;
 	/* DIALOGUE_FAILED: one sentence, what is wrong and what to do. CONFIGURING after STREAMING: why it begins anew.
-	 * STREAMING: what is not as it was wanted, if anything. */
+	 * STREAMING: what is not as it was wanted, if anything; each change is told. */
 	char error[160];
 };
 

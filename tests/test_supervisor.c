@@ -34,6 +34,7 @@ static struct world {
 	size_t at_once;   /* a read delivers so many of its first byte */
 	char pending[64]; /* what the device has to say */
 	char heard[64];   /* what it was told */
+	char note[160];   /* of the dialogue, while it streams */
 	int opens, closes, bauds, flushes, resets;
 	uint32_t baud;
 	struct dialogue *dialogue;
@@ -161,6 +162,8 @@ static void fake_data(struct dialogue *dialogue, int64_t t_ns)
 static void fake_step(struct dialogue *dialogue, int64_t t_ns, struct dialogue_step *ret)
 {
 	ret->state = dialogue->phase >= LIVE ? DIALOGUE_STREAMING : DIALOGUE_CONFIGURING;
+	if (ret->state == DIALOGUE_STREAMING)
+		memcpy(ret->error, world[dialogue->device].note, sizeof(ret->error));
 	if (world[dialogue->device].asks_without_end) {
 		ret->flush = true;
 		ret->deadline_ns = t_ns;
@@ -716,6 +719,47 @@ static void a_device_that_is_set_up_again_is_lost_and_back(void **state)
 	end();
 }
 
+/* A servo that was halted by its limit goes on telling its angle, so the stream stands. */
+static void a_note_that_changes_while_it_streams_is_told_each_time(void **state)
+{
+	(void)state;
+	begin(&fake, NULL, NULL);
+	greet(10 * MS);
+	strcpy(world[0].note, "the sweep stopped at a limit");
+	for (int i = 1; i < 20; i++)
+		say(0, "d", i * 100 * MS);
+	assert_string_equal(supervisor_device(supervisor, 0)->note, "the sweep stopped at a limit");
+	assert_int_equal(logs, 2);
+	assert_string_equal(log_lines[1].text, "the sweep stopped at a limit");
+	world[0].note[0] = 0;
+	say(0, "d", 2 * SECOND);
+	say(0, "d", 2 * SECOND + MS);
+	assert_string_equal(supervisor_device(supervisor, 0)->note, "");
+	assert_int_equal(logs, 3);
+	assert_string_equal(log_lines[2].text, "in order again");
+	assert_int_equal(supervisor_device(supervisor, 0)->losses, 0);
+	end();
+}
+
+/* A bus between warning and passive: a minute of it costs few lines, and how it ended is told. */
+static void a_note_that_changes_without_end_costs_few_lines(void **state)
+{
+	(void)state;
+	begin(&fake, NULL, NULL);
+	greet(10 * MS);
+	for (int i = 1; i < 590; i++) {
+		snprintf(world[0].note, sizeof(world[0].note), "state %d", i);
+		say(0, "d", i * 100 * MS);
+	}
+	assert_in_range(logs, 3, 8);
+	assert_string_equal(supervisor_device(supervisor, 0)->note, "state 589");
+	for (int i = 590; i < 700; i++)
+		say(0, "d", i * 100 * MS);
+	assert_in_range(logs, 4, 9);
+	assert_string_equal(log_lines[logs - 1].text, "state 589");
+	end();
+}
+
 int main(void)
 {
 	const struct CMUnitTest tests[] = {
@@ -740,6 +784,8 @@ int main(void)
 	    cmocka_unit_test(a_device_that_comes_and_goes_for_ever_new_reasons_costs_few_lines),
 	    cmocka_unit_test(a_telegram_now_and_then_forgives_the_noise_between),
 	    cmocka_unit_test(a_device_that_is_set_up_again_is_lost_and_back),
+	    cmocka_unit_test(a_note_that_changes_while_it_streams_is_told_each_time),
+	    cmocka_unit_test(a_note_that_changes_without_end_costs_few_lines),
 	};
 
 	return cmocka_run_group_tests(tests, NULL, NULL);

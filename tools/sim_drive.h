@@ -15,8 +15,7 @@
  *    status   1 moving, 2 ready, 4 enabled, 8 fault, 16 in position, 32 homed, 64 stopped by the watchdog
  *
  * The simple drive (default) goes where `target` says as soon as it is written. The strict one takes a target only when it
- * is enabled and at the edge of `start`. The watchdog begins with its first write: not written (with another value than
- * before) for its time, the drive stops, in either kind, and takes no target until it is written again. A fault
+ * is enabled and at the edge of `start`. The watchdog begins with its first write: not written for its time, the drive stops, in either kind, and takes no target until it is written again. A fault
  * disables; it is left by the edge of reset. */
 #ifndef FACET_TOOLS_SIM_DRIVE_H
 #define FACET_TOOLS_SIM_DRIVE_H
@@ -56,6 +55,7 @@ struct sim_drive_params {
 	int unit;     /* 1..247 */
 	bool strict;  /* enable and start are needed */
 	bool unhomed; /* strict: no start before `home` */
+	bool toggles; /* the watchdog counts only a value that differs from the one before */
 	enum { SIM_DRIVE_ABCD, SIM_DRIVE_CDAB, SIM_DRIVE_BADC, SIM_DRIVE_DCBA } order; /* as config_register's */
 	struct sim_axis *axis;                                                         /* borrowed; NULL: its own ... */
 	double angle_rad;    /* ... that stands there at first */
@@ -72,6 +72,9 @@ struct sim_axis *sim_drive_axis(struct sim_drive *);
  * 4 not in this state. A write of several is done whole or not at all. */
 int sim_drive_read(struct sim_drive *, uint16_t address, uint16_t n, int64_t t_ns, uint16_t *ret_values);
 int sim_drive_write(struct sim_drive *, uint16_t address, uint16_t n, const uint16_t *values, int64_t t_ns);
+
+/* It stands there, by magic, and that is its target: recorded sweeps being played. */
+void sim_drive_place(struct sim_drive *, double angle_rad, int64_t t_ns);
 
 /* A request and what comes back, faults included. Of `request` the unit, the function (3, 4, 6, 16), address, n and, of
  * writes, the values count. */

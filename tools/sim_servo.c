@@ -1,13 +1,10 @@
-/* A servo behind Modbus: a libmodbus server in a thread of its own, on a pseudo-terminal or on TCP.
- *
- * The servo moves with its speed towards its target, in a straight line of angle over time; each change of target,
- * speed or place begins a new *leg*, and the last legs are kept, so that the angle at any time of the last seconds can
- * be computed, which is what the simulated scanner asks for beam by beam. Nothing is advanced by a timer: where it
- * stands is a function of time.
+/* A servo behind Modbus: a register map (sim_drive.h) behind a libmodbus server in a thread of its own, on a
+ * pseudo-terminal or on TCP.
  *
  * A pseudo-terminal has no parity and takes every rate: the line is 8N1 and its rate means nothing. The slave is made
  * raw before anybody opens it (a fresh one echoes), and kept open here, so that a driver that comes and goes does not
- * end the line. libmodbus is given the master's descriptor and never opens anything itself.
+ * end the line. libmodbus is given the master's descriptor and never opens anything itself. It cuts requests out of the
+ * line and judges them; answers are put together here, because some have to be wrong.
  *
  * Who plays a recording through it wants to know which answers its reader took: an answer that came after the reader's
  * time-out was thrown away, and one that was slow on its way is refused by a careful reader. The servo sees neither, but
@@ -15,11 +12,10 @@
  * both as short as such pauses usually are (the median of the last ones, and a millisecond).
  *
  * Times are CLOCK_MONOTONIC in ns, as uv_hrtime says them. */
-#include "tools/sim_device.h"
+#include "tools/sim_drive.h"
 
 #include <errno.h>
 #include <fcntl.h>
-#include <math.h>
 #include <modbus.h>
 #include <netinet/in.h>
 #include <poll.h>
@@ -33,24 +29,11 @@
 #include <time.h>
 #include <unistd.h>
 
-#include "core/trig.h"
-
-#define LEGS          64      /* a power of two; older movement is forgotten */
-#define CLIENTS_MAX   4       /* one more is closed at once */
-#define SPEED_DEFAULT 30000.0 /* 0.001 degree/s */
-#define COUNT_RAD     (0.001 * TRIG_DEG)
+#define CLIENTS_MAX   4      /* one more is closed at once */
 #define REQUEST_US    500000 /* a frame that began is whole by then, or dropped */
 #define PAUSES        31
 #define PAUSE_MORE_NS 1000000
 #define PAUSE_MAX_NS  200000000 /* shorter than any reader's time-out and recovery */
-
-struct leg { /* from t_ns on; counts of 0.001 degree */
-	int64_t t_ns;
-	double from, to, speed;
-};
-
-static const char *const kinds[] = {"silence", "lost", "busy", "late", NULL};
-enum fault { SILENCE, LOST, BUSY, LATE, FAULTS };
 
 struct sim_servo {
 	int slave;
@@ -59,21 +42,17 @@ struct sim_servo {
 	int port;
 	int client[CLIENTS_MAX];
 	modbus_t *modbus;
-	modbus_mapping_t *map;
 	pthread_t thread;
 	bool running;
 
 	pthread_mutex_t lock; /* of what follows */
-	struct leg leg[LEGS];
-	uint32_t legs; /* ever begun; the newest is (legs - 1) % LEGS */
+	struct sim_drive *drive;
 	uint64_t answers;
 	int64_t pause_ns[PAUSES]; /* between an answer and the next request */
 	uint32_t pauses;
 	int64_t answered_ns; /* the last answer, of whatever */
 	bool prompt;         /* the request before it came in good time */
-	struct sim_fault_state fault[FAULTS];
-	uint64_t random;
-	bool pending; /* it carried the angle, and is to be counted when the next request comes */
+	bool pending;        /* it carried the angle, and is to be counted when the next request comes */
 };
 
 static int64_t now_ns(void)
@@ -84,77 +63,10 @@ static int64_t now_ns(void)
 	return (int64_t)ts.tv_sec * 1000000000 + ts.tv_nsec;
 }
 
-static double leg_position(const struct leg *leg, int64_t t_ns)
+static bool reads_position(const struct modbus_transaction *t)
 {
-	double way = leg->speed * (double)(t_ns - leg->t_ns) * 1e-9, whole = leg->to - leg->from;
-
-	if (t_ns <= leg->t_ns)
-		return leg->from;
-	if (way >= fabs(whole))
-		return leg->to;
-	return leg->from + (whole < 0.0 ? -way : way);
-}
-
-static const struct leg *leg_at(const struct sim_servo *s, int64_t t_ns)
-{
-	uint32_t oldest = s->legs > LEGS ? s->legs - LEGS : 0, i = s->legs - 1;
-
-	while (i > oldest && s->leg[i % LEGS].t_ns > t_ns)
-		i--;
-	return &s->leg[i % LEGS];
-}
-
-static double position(const struct sim_servo *s, int64_t t_ns)
-{
-	return leg_position(leg_at(s, t_ns), t_ns);
-}
-
-static void begin_leg(struct sim_servo *s, int64_t t_ns, double from, double to, double speed)
-{
-	s->leg[s->legs++ % LEGS] = (struct leg){t_ns, from, to, speed};
-}
-
-static void put32(uint16_t *registers, int at, int32_t value)
-{
-	registers[at] = (uint16_t)((uint32_t)value >> 16);
-	registers[at + 1] = (uint16_t)value;
-}
-
-static int32_t get32(const uint16_t *registers, int at)
-{
-	return (int32_t)((uint32_t)registers[at] << 16 | registers[at + 1]);
-}
-
-/* The registers as they are now; both register kinds show the same. */
-static void fill_registers(struct sim_servo *s, int64_t t_ns)
-{
-	const struct leg *leg = leg_at(s, t_ns);
-	double at = leg_position(leg, t_ns);
-	uint16_t *r = s->map->tab_registers;
-
-	put32(r, SIM_SERVO_POSITION, (int32_t)rint(at));
-	put32(r, SIM_SERVO_TARGET, (int32_t)rint(leg->to));
-	put32(r, SIM_SERVO_SPEED, (int32_t)(uint32_t)rint(leg->speed));
-	r[SIM_SERVO_MOVING] = at != leg->to;
-	memcpy(s->map->tab_input_registers, r, SIM_SERVO_REGISTERS * sizeof *r);
-}
-
-/* A write may have changed target or speed: then it goes on from where it is. */
-static void take_registers(struct sim_servo *s, int64_t t_ns)
-{
-	const struct leg *leg = leg_at(s, t_ns);
-	const uint16_t *r = s->map->tab_registers;
-	double to = get32(r, SIM_SERVO_TARGET), speed = (uint32_t)get32(r, SIM_SERVO_SPEED);
-
-	if (to != rint(leg->to) || speed != rint(leg->speed))
-		begin_leg(s, t_ns, leg_position(leg, t_ns), to, speed);
-}
-
-static bool reads_position(const uint8_t *pdu)
-{
-	int address = pdu[1] << 8 | pdu[2], n = pdu[3] << 8 | pdu[4];
-
-	return (pdu[0] == 3 || pdu[0] == 4) && address <= SIM_SERVO_POSITION && address + n >= SIM_SERVO_POSITION + 2;
+	return (t->function == 3 || t->function == 4) && t->address <= SIM_SERVO_POSITION &&
+	       t->address + t->n >= SIM_SERVO_POSITION + 2;
 }
 
 static int speak_rtu(struct sim_servo *s)
@@ -196,27 +108,107 @@ static void judge_last_answer(struct sim_servo *s, int64_t t_ns)
 	s->pending = false;
 }
 
-/* The registers are filled. False: this request is not answered, or by an exception. Late, the answer carries the angle of
- * before. The lock is let go of meanwhile; who ends the thread ends the wait. */
-static bool befalls(struct sim_servo *s, const uint8_t *request)
+/* A frame that libmodbus found whole, `header` bytes of it before the function. */
+static void understand(const uint8_t *frame, int len, int header, struct modbus_transaction *ret)
+{
+	const uint8_t *pdu = frame + header;
+	int n = len - header;
+
+	memset(ret, 0, sizeof *ret);
+	ret->unit = frame[header - 1];
+	ret->function = pdu[0];
+	if (n < 5)
+		return; /* a function of which we know nothing */
+	ret->address = (uint16_t)(pdu[1] << 8 | pdu[2]);
+	ret->n = (uint16_t)(pdu[3] << 8 | pdu[4]);
+	if (ret->function == 6) {
+		ret->value[0] = ret->n;
+		ret->n = 1;
+	}
+	for (int i = 0; ret->function == 16 && i < ret->n && i < MODBUS_WIRE_VALUES_MAX && 7 + 2 * i < n; i++)
+		ret->value[i] = (uint16_t)(pdu[6 + 2 * i] << 8 | pdu[7 + 2 * i]);
+}
+
+static size_t put_pdu(const struct modbus_transaction *t, uint8_t *ret)
+{
+	size_t n = 0;
+
+	ret[n++] = t->function;
+	if (t->function & MODBUS_WIRE_REFUSED) {
+		ret[n++] = (uint8_t)t->value[0];
+		return n;
+	}
+	if (t->function == 6 || t->function == 16) {
+		uint16_t last = t->function == 6 ? t->value[0] : t->n;
+
+		ret[n++] = (uint8_t)(t->address >> 8);
+		ret[n++] = (uint8_t)t->address;
+		ret[n++] = (uint8_t)(last >> 8);
+		ret[n++] = (uint8_t)last;
+		return n;
+	}
+	ret[n++] = (uint8_t)(2 * t->n);
+	for (int i = 0; i < t->n; i++) {
+		ret[n++] = (uint8_t)(t->value[i] >> 8);
+		ret[n++] = (uint8_t)t->value[i];
+	}
+	return n;
+}
+
+static uint16_t crc16(const uint8_t *bytes, size_t len)
+{
+	uint16_t crc = 0xffff;
+
+	for (size_t i = 0; i < len; i++) {
+		crc ^= bytes[i];
+		for (int bit = 0; bit < 8; bit++)
+			crc = (uint16_t)(crc & 1 ? crc >> 1 ^ 0xa001 : crc >> 1);
+	}
+	return crc;
+}
+
+/* TCP has no check sum of its own: a corrupt answer carries another protocol's id, which must be 0. */
+static size_t put_answer(const struct sim_servo *s, const uint8_t *request, const struct sim_drive_answer *answer,
+                         uint8_t *ret)
+{
+	bool corrupt = answer->verdict == SIM_DRIVE_CORRUPT;
+	size_t n, at = s->port ? 7 : 1;
+	uint16_t crc;
+
+	ret[at - 1] = answer->transaction.unit;
+	n = at + put_pdu(&answer->transaction, ret + at);
+	if (s->port) {
+		memcpy(ret, request, 2);
+		ret[2] = 0;
+		ret[3] = corrupt;
+		ret[4] = (uint8_t)((n - 6) >> 8);
+		ret[5] = (uint8_t)(n - 6);
+		return n;
+	}
+	crc = (uint16_t)(crc16(ret, n) ^ (corrupt ? 0x5500 : 0));
+	ret[n++] = (uint8_t)crc;
+	ret[n++] = (uint8_t)(crc >> 8);
+	return n;
+}
+
+/* The answer leaves, late if that was ordered: the lock is let go of meanwhile; who ends the thread ends the wait. */
+static bool reply(struct sim_servo *s, const uint8_t *request, const struct sim_drive_answer *answer)
 {
 	struct pollfd stop = {.fd = s->stop[0], .events = POLLIN};
+	uint8_t bytes[MODBUS_TCP_MAX_ADU_LENGTH];
+	size_t len;
 
-	if (s->fault[SILENCE].on || (s->fault[LOST].on && sim_random(&s->random) < s->fault[LOST].value) ||
-	    (!s->fault[LOST].on && sim_fault_due(&s->fault[LOST])))
-		return false;
-	if (sim_fault_due(&s->fault[BUSY])) {
-		modbus_reply_exception(s->modbus, request, MODBUS_EXCEPTION_SLAVE_OR_SERVER_BUSY);
-		return false;
-	}
-	if (sim_fault_due(&s->fault[LATE])) {
-		int ms = (int)sim_fault_value(&s->fault[LATE], 20.0);
-
+	if (answer->verdict == SIM_DRIVE_SILENT)
+		return true;
+	if (answer->verdict == SIM_DRIVE_DROPPED)
+		return !s->port;
+	if (answer->delay_ns > 0) {
 		pthread_mutex_unlock(&s->lock);
-		poll(&stop, 1, ms);
+		poll(&stop, 1, (int)(answer->delay_ns / 1000000));
 		pthread_mutex_lock(&s->lock);
 	}
-	return true;
+	len = put_answer(s, request, answer, bytes);
+	return write(modbus_get_socket(s->modbus), bytes, len) == (ssize_t)len;
 }
 
 /* One request of the current line. False: the line is lost. An answer counts with the angle it carries. */
@@ -224,29 +216,30 @@ static bool serve(struct sim_servo *s)
 {
 	uint8_t request[MODBUS_TCP_MAX_ADU_LENGTH];
 	int n = modbus_receive(s->modbus, request), header = modbus_get_header_length(s->modbus);
+	struct modbus_transaction asked;
+	struct sim_drive_answer answer;
 	int64_t t_ns;
+	bool alive;
 
 	if (n < 0)
 		return errno == EMBBADCRC || errno == ETIMEDOUT || errno == EMBBADDATA;
 	/* For another unit: libmodbus would take the next request for that unit's answer, but nobody else is on this line. */
 	if (n == 0)
 		return s->port || speak_rtu(s) == 0;
-	if (s->port && request[header - 1] != s->slave && request[header - 1] != MODBUS_TCP_SLAVE)
-		return true;
+	understand(request, s->port ? n : n - 2, header, &asked);
+	if (s->port && asked.unit == MODBUS_TCP_SLAVE)
+		asked.unit = (uint8_t)s->slave;
 	pthread_mutex_lock(&s->lock);
 	t_ns = now_ns(); /* what a write asks for begins before its answer is seen */
 	judge_last_answer(s, t_ns);
-	fill_registers(s, t_ns);
-	if (!befalls(s, request)) {
-		pthread_mutex_unlock(&s->lock);
-		return true;
-	}
-	n = modbus_reply(s->modbus, request, n, s->map);
-	take_registers(s, t_ns);
-	s->pending = n >= 0 && reads_position(request + header);
+	sim_drive_transact(s->drive, &asked, t_ns, &answer);
+	if (s->port && answer.verdict == SIM_DRIVE_ANSWERED)
+		answer.transaction.unit = request[header - 1];
+	alive = reply(s, request, &answer);
+	s->pending = alive && answer.verdict == SIM_DRIVE_ANSWERED && reads_position(&answer.transaction);
 	s->answered_ns = now_ns();
 	pthread_mutex_unlock(&s->lock);
-	return n >= 0;
+	return alive;
 }
 
 static void accept_client(struct sim_servo *s)
@@ -272,6 +265,18 @@ static void serve_client(struct sim_servo *s, int i)
 	s->client[i] = -1;
 }
 
+/* The drive stops by itself when its time has come. Until then, in ms. */
+static int advance(struct sim_servo *s)
+{
+	int64_t t_ns = now_ns(), deadline;
+
+	pthread_mutex_lock(&s->lock);
+	sim_drive_advance(s->drive, t_ns);
+	deadline = sim_drive_deadline(s->drive);
+	pthread_mutex_unlock(&s->lock);
+	return deadline - t_ns > 1000000000 ? 1000 : deadline > t_ns ? (int)((deadline - t_ns) / 1000000) + 1 : 0;
+}
+
 static void *servo_thread(void *arg)
 {
 	struct sim_servo *s = arg;
@@ -282,7 +287,7 @@ static void *servo_thread(void *arg)
 		p[1] = (struct pollfd){.fd = s->port ? s->listener : s->master, .events = POLLIN};
 		for (int i = 0; i < CLIENTS_MAX; i++)
 			p[2 + i] = (struct pollfd){.fd = s->client[i], .events = POLLIN};
-		if (poll(p, 2 + CLIENTS_MAX, -1) < 0 && errno != EINTR)
+		if (poll(p, 2 + CLIENTS_MAX, advance(s)) < 0 && errno != EINTR)
 			return NULL;
 		if (p[0].revents)
 			return NULL;
@@ -349,8 +354,7 @@ static int start(struct sim_servo *s)
 	sigset_t all, before;
 	int r;
 
-	s->map = modbus_mapping_new(0, 0, SIM_SERVO_REGISTERS, SIM_SERVO_REGISTERS);
-	if (!s->map || pipe2(s->stop, O_CLOEXEC) < 0)
+	if (pipe2(s->stop, O_CLOEXEC) < 0)
 		return -errno;
 	sigfillset(&all);
 	pthread_sigmask(SIG_SETMASK, &all, &before); /* signals are the loop's */
@@ -364,10 +368,18 @@ struct sim_servo *sim_servo_create(const struct sim_servo_params *params, char e
 {
 	struct sim_servo *s = calloc(1, sizeof *s);
 	const char *where = params->rtu ? params->rtu : params->tcp;
-	double at = params->angle_rad / COUNT_RAD;
+	struct sim_drive_params drive = {.unit = params->slave, .angle_rad = params->angle_rad};
 	int r;
 
-	if (!s) {
+	if (params->drive)
+		drive = *params->drive;
+	drive.unit = params->slave;
+	drive.angle_rad = params->angle_rad;
+	drive.axis = NULL;
+	if (s)
+		s->drive = sim_drive_create(&drive, now_ns());
+	if (!s || !s->drive) {
+		free(s);
 		snprintf(error, 160, "out of memory");
 		return NULL;
 	}
@@ -376,7 +388,6 @@ struct sim_servo *sim_servo_create(const struct sim_servo_params *params, char e
 	for (int i = 0; i < CLIENTS_MAX; i++)
 		s->client[i] = -1;
 	pthread_mutex_init(&s->lock, NULL);
-	begin_leg(s, now_ns(), at, at, SPEED_DEFAULT);
 	r = params->rtu ? open_pty(s, params->rtu) : open_tcp(s, params->tcp);
 	if (!r)
 		r = start(s);
@@ -412,8 +423,7 @@ void sim_servo_destroy(struct sim_servo *s)
 	close_if(s->stop[1]);
 	if (s->modbus)
 		modbus_free(s->modbus);
-	if (s->map)
-		modbus_mapping_free(s->map);
+	sim_drive_destroy(s->drive);
 	pthread_mutex_destroy(&s->lock);
 	free(s);
 }
@@ -425,20 +435,19 @@ int sim_servo_port(const struct sim_servo *s)
 
 double sim_servo_angle(struct sim_servo *s, int64_t t_ns)
 {
-	double at;
+	double angle_rad;
 
 	pthread_mutex_lock(&s->lock);
-	at = position(s, t_ns);
+	sim_drive_advance(s->drive, now_ns());
+	angle_rad = sim_axis_angle(sim_drive_axis(s->drive), t_ns);
 	pthread_mutex_unlock(&s->lock);
-	return at * COUNT_RAD;
+	return angle_rad;
 }
 
 void sim_servo_place(struct sim_servo *s, double angle_rad)
 {
-	double at = angle_rad / COUNT_RAD;
-
 	pthread_mutex_lock(&s->lock);
-	begin_leg(s, now_ns(), at, at, leg_at(s, now_ns())->speed);
+	sim_drive_place(s->drive, angle_rad, now_ns());
 	s->pending = false; /* it carried the angle of before */
 	pthread_mutex_unlock(&s->lock);
 }
@@ -455,19 +464,15 @@ uint64_t sim_servo_answers(struct sim_servo *s)
 
 const char *const *sim_servo_fault_kinds(void)
 {
-	return kinds;
+	return sim_drive_fault_kinds();
 }
 
 bool sim_servo_fault(struct sim_servo *s, const struct sim_fault *fault, bool on)
 {
-	int i = sim_fault_index(kinds, fault->kind);
+	bool known;
 
-	if (i < 0)
-		return false;
 	pthread_mutex_lock(&s->lock);
-	sim_fault_set(&s->fault[i], fault, on);
-	if (i == LOST && s->fault[i].value == 0.0)
-		s->fault[i].value = 1.0;
+	known = sim_drive_fault(s->drive, fault, on, now_ns());
 	pthread_mutex_unlock(&s->lock);
-	return true;
+	return known;
 }

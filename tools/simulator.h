@@ -74,17 +74,20 @@ const char *const *sim_tcp_fault_kinds(void);
 
 /* A servo behind Modbus (libmodbus server): really moves with a speed. Position in 0.001 degree, i32 in two registers. */
 enum sim_servo_register { /* holding registers, also readable as input registers; 32-bit values high word first */
-	                  SIM_SERVO_POSITION = 0, /* 0,1: actual position */
-	                  SIM_SERVO_TARGET = 2,   /* 2,3: where to go */
-	                  SIM_SERVO_SPEED = 4,    /* 4,5: 0.001 degree/s, unsigned */
-	                  SIM_SERVO_MOVING = 6,   /* 1 while it moves */
-	                  SIM_SERVO_REGISTERS = 16
+	                  SIM_SERVO_POSITION = 0,  /* 0,1: actual position */
+	                  SIM_SERVO_TARGET = 2,    /* 2,3: where to go */
+	                  SIM_SERVO_SPEED = 4,     /* 4,5: 0.001 degree/s, unsigned */
+	                  SIM_SERVO_MOVING = 6,    /* 1 while it moves */
+	                  SIM_SERVO_REGISTERS = 32 /* the others: sim_drive.h */
 };
+struct sim_drive_params;
 struct sim_servo_params {
 	const char *rtu;  /* path of the link to a pty's slave (8N1), or NULL */
 	const char *tcp;  /* host:port, port 0: any; or NULL */
 	int slave;        /* unit id */
 	double angle_rad; /* where it stands at first, in the servo's own sense */
+	/* NULL: the simple one, without acceleration; its own unit, axis and angle do not count */
+	const struct sim_drive_params *drive;
 };
 struct sim_servo;
 struct sim_servo *sim_servo_create(const struct sim_servo_params *, char error[160]);
@@ -96,7 +99,7 @@ double sim_servo_angle(
 void sim_servo_place(struct sim_servo *, double angle_rad); /* stands there from now on (playback steps) */
 uint64_t sim_servo_answers(
     struct sim_servo *); /* position reads so far whose answer was taken in good time, as the next request shows */
-/* Its faults: "silence", "lost" (share of its answers), "busy" (exception 6), "late" (ms; the angle is that of before). */
+/* Its faults: those of sim_drive.h. */
 bool sim_servo_fault(struct sim_servo *, const struct sim_fault *, bool on);
 const char *const *sim_servo_fault_kinds(void);
 

@@ -3,6 +3,7 @@
 #ifndef FACET_DRIVERS_CANOPEN_PARTS_H
 #define FACET_DRIVERS_CANOPEN_PARTS_H
 
+#include "drivers/can_bus.h"
 #include "drivers/canopen_wire.h"
 #include "drivers/driver.h"
 
@@ -15,7 +16,7 @@ enum canopen_reply {
 	CANOPEN_REPLY_STATUS, /* uint16_t: statusword from a TPDO */
 	CANOPEN_REPLY_ANGLE,  /* struct canopen_angle: as the tilt that was decoded */
 	CANOPEN_REPLY_VALUE,  /* struct canopen_value: any other mapped object */
-	CANOPEN_REPLY_BUS     /* struct can_frame_at: an error frame, or frames lost (CAN_WIRE_LOST) */
+	CANOPEN_REPLY_BUS = CAN_BUS_REPLY /* uint8_t: enum can_bus_health, where it changed */
 };
 struct canopen_angle {
 	int64_t t_ns; /* of sampling: of the SYNC where there was one */

@@ -57,8 +57,8 @@ struct canopen_setup {
 	int at;              /* which object, then which PDO */
 	int step;            /* within it */
 	uint32_t cob, count; /* of the PDO at hand, as read; of 1016: entries */
-	bool cob_differs, parameters_differ[6], mapping_differs;
-	int free_sub;
+	bool differs, parameter_differs[3], mapping_differs;
+	int free_sub; /* of 1016; 0: none */
 };
 
 /* Nothing is in the lists. */

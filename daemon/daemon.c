@@ -9,8 +9,8 @@
  * Log time is taken here and nowhere else: realtime at the start plus what the monotonic clock has counted since, so it
  * never goes back and a corrected wall clock moves nothing: only who sends us its time is told. All records of one turn of a device carry one time.
  *
- * The end: devices are stopped (a second at most), then sockets and handles are closed and the loop runs dry; whatever
- * hangs, LAST_MS after the signal everything is closed. */
+ * The end: devices are stopped (a second at most, more where a servo goes to its rest angle), then sockets and handles
+ * are closed and the loop runs dry; whatever hangs, LAST_MS later everything is closed. */
 #include "daemon/daemon.h"
 
 #include <assert.h>
@@ -35,7 +35,7 @@
 
 #define TICK_MS       100
 #define STEP_NS       1000000 /* the wall clock was set if it is off by more */
-#define LAST_MS       2000
+#define LAST_MS       1000
 #define LATENCIES     1024 /* the newest, for the percentiles */
 #define RATE_SECONDS  4    /* rates are means over so long */
 #define CLIENTS_SHOWN 64
@@ -544,7 +544,7 @@ static void stop(struct daemon *d)
 		return;
 	d->stopping = true;
 	notify_stopping();
-	uv_timer_start(&d->last, on_last, LAST_MS, 0);
+	uv_timer_start(&d->last, on_last, (uint64_t)supervisor_stop_ns(d->config) / 1000000 + LAST_MS, 0);
 	supervisor_stop(d->supervisor, now(d));
 	set_device_timer(d);
 }

@@ -536,10 +536,15 @@ void supervisor_start(struct supervisor *s, int64_t t_ns)
 		open_line(s, &s->line[i], t_ns);
 }
 
+int64_t supervisor_stop_ns(const struct config *config)
+{
+	return config->sweep.set && config->sweep.has_rest ? SUPERVISOR_REST_NS : SUPERVISOR_STOP_NS;
+}
+
 void supervisor_stop(struct supervisor *s, int64_t t_ns)
 {
 	s->stopping = true;
-	s->stop_ns = t_ns + SUPERVISOR_STOP_NS;
+	s->stop_ns = t_ns + supervisor_stop_ns(s->config);
 	for (int i = 0; i < s->config->devices; i++) {
 		struct line *line = &s->line[i];
 

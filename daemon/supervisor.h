@@ -9,8 +9,10 @@
 #define SUPERVISOR_BACKOFF_MAX_NS 1000000000ll /* ... up to here: who is back is asked within 2 s */
 #define SUPERVISOR_OPEN_NS        1500000000ll /* whoever takes no byte for so long after it was opened is not there */
 #define SUPERVISOR_STEADY_NS      2000000000ll /* who streamed so long begins with the first back-off again */
-#define SUPERVISOR_STOP_NS        1000000000ll /* an orderly end takes no longer */
-#define SUPERVISOR_READS_MAX      16           /* of one device in one turn of the loop */
+#define SUPERVISOR_STOP_NS        1000000000ll /* an orderly end takes no longer ... */
+#define SUPERVISOR_REST_NS \
+	8000000000ll            /* ... or so long where a servo goes to its rest angle (systemd kills after 10 s) */
+#define SUPERVISOR_READS_MAX 16 /* of one device in one turn of the loop */
 /* What one device may cost: beyond it reading waits, and the kernel holds the rest. Five echoes of an LMS5xx in CoLa-A,
  * the most that any device has to say, are 1 MB/s. */
 #define SUPERVISOR_BYTES_PER_S 2000000
@@ -58,7 +60,8 @@ int64_t supervisor_deadline(const struct supervisor *); /* call supervisor_timer
 void supervisor_reply(struct supervisor *, int device, const struct reply *);
 void supervisor_data(struct supervisor *, int device, int64_t t_ns);
 
-/* The orderly end: devices are stopped, at most SUPERVISOR_STOP_NS long. */
+/* The orderly end: devices are stopped, at most so long. */
+int64_t supervisor_stop_ns(const struct config *);
 void supervisor_stop(struct supervisor *, int64_t t_ns);
 bool supervisor_stopped(const struct supervisor *);
 

@@ -54,7 +54,7 @@ DAEMON := $(filter-out daemon/facetd.c,$(wildcard daemon/*.c))
 TOOLS := $(filter-out tools/facet.c,$(wildcard tools/*.c))
 TESTS := $(patsubst tests/%.c,%,$(wildcard tests/test_*.c))
 PROGRAMS := clients steps usb_bed gadget
-RIGGED := $(filter test_rig test_cola_sessions test_matrix_% test_chaos,$(TESTS)) # they stand on tests/rig.c
+RIGGED := $(filter test_rig test_cola_sessions test_matrix_% test_chaos test_servos,$(TESTS)) # they stand on tests/rig*.c
 THREADED := test_worker test_server test_replay test_modbus_bus test_sim_servo test_client
 FUZZ := $(patsubst tests/%.c,%,$(wildcard tests/fuzz_*.c))
 LIBRARIES := $(B)/libtools.a $(B)/libdaemon.a $(B)/libdrivers.a $(B)/libconfig.a $(B)/libcore.a
@@ -98,7 +98,7 @@ $(B)/facetd: $(B)/obj/daemon/facetd.o $(filter-out $(B)/libtools.a,$(LIBRARIES))
 $(B)/facet: $(B)/obj/tools/facet.o $(LIBRARIES)
 	@echo '  LD   $@'
 	$(Q)$(CC) $(LDFLAGS_ALL) -o $@ $^ $(LIBS)
-$(addprefix $(B)/tests/,$(RIGGED)): $(B)/obj/tests/rig.o $(B)/obj/tests/matrix.o
+$(addprefix $(B)/tests/,$(RIGGED)): $(patsubst %.c,$(B)/obj/%.o,$(wildcard tests/rig*.c)) $(B)/obj/tests/matrix.o
 $(B)/tests/test_%: $(B)/obj/tests/test_%.o $(LIBRARIES)
 	@mkdir -p $(@D)
 	@echo '  LD   $@'

@@ -27,6 +27,7 @@
 
 #include "drivers/can_bus.h"
 #include "drivers/can_interface.h"
+#include "drivers/can_words.h"
 #include "drivers/loop_clock.h"
 
 #define FRAMES_MAX 32 /* of one read */
@@ -62,11 +63,6 @@ static ssize_t kernel_send(int fd, const void *bytes, size_t len, int flags)
 	return send(fd, bytes, len, flags);
 }
 
-static bool is_hub(const char *connect)
-{
-	return strncmp(connect, "unix:", 5) == 0;
-}
-
 struct link *can_link_over(int fd, const char *connect, const struct can_link_filter *filters, int n,
                            const struct can_link_calls *calls)
 {
@@ -77,7 +73,7 @@ struct link *can_link_over(int fd, const char *connect, const struct can_link_fi
 		return NULL;
 	}
 	link->fd = fd;
-	link->entries = is_hub(connect);
+	link->entries = can_words_hub(connect);
 	snprintf(link->connect, sizeof link->connect, "%s", connect);
 	link->filters = n < CAN_LINK_FILTERS_MAX ? n : CAN_LINK_FILTERS_MAX;
 	for (int i = 0; i < link->filters; i++)
@@ -112,21 +108,6 @@ static int set_up(int fd, const struct can_link_filter *filters, int n)
 	return 0;
 }
 
-static void tell_opening(const char *name, int error, char ret[160])
-{
-	if (error == ENODEV || error == ENXIO)
-		snprintf(ret, 160,
-		         "there is no interface %.15s: plug the adapter in, load its driver, or correct `connect`",
-		         name);
-	else if (error == ENETDOWN)
-		snprintf(ret, 160, "%.15s is down: `ip link set %.15s up type can bitrate 500000 restart-ms 100`", name,
-		         name);
-	else if (error == EAFNOSUPPORT)
-		snprintf(ret, 160, "%.15s is no CAN interface; correct `connect`", name);
-	else
-		snprintf(ret, 160, "%.15s: %s", name, strerror(error));
-}
-
 static struct link *open_interface(const char *name, const struct can_link_filter *filters, int n, char error[160])
 {
 	const int fd = socket(PF_CAN, SOCK_RAW | SOCK_CLOEXEC | SOCK_NONBLOCK, CAN_RAW);
@@ -147,7 +128,7 @@ static struct link *open_interface(const char *name, const struct can_link_filte
 	if (!r && bind(fd, (struct sockaddr *)&address, sizeof address) < 0)
 		r = -errno;
 	if (r) {
-		tell_opening(name, -r, error);
+		can_words_opening(name, -r, error);
 		close(fd);
 		return NULL;
 	}
@@ -192,8 +173,8 @@ static struct link *open_hub(const char *connect_to, const struct can_link_filte
 
 struct link *can_link_open(const char *connect_to, const struct can_link_filter *filters, int n, char error[160])
 {
-	return is_hub(connect_to) ? open_hub(connect_to, filters, n, error)
-	                          : open_interface(connect_to, filters, n, error);
+	return can_words_hub(connect_to) ? open_hub(connect_to, filters, n, error)
+	                                 : open_interface(connect_to, filters, n, error);
 }
 
 int can_link_fd(const struct link *link)
@@ -401,22 +382,7 @@ ssize_t can_link_write(struct link *link, const uint8_t *bytes, size_t len)
 
 void can_link_error(const struct link *link, int error, char ret[160])
 {
-	const char *name = link->connect;
-
-	if (link->entries && (error == ECONNRESET || error == EPIPE || error == ENOTCONN))
-		snprintf(ret, 160, "%.100s: whoever carried CAN frames there has gone", name);
-	else if (link->entries)
-		snprintf(ret, 160, "%.100s: %s", name, strerror(error));
-	else if (error == ENODEV || error == ENXIO)
-		snprintf(ret, 160, "the interface %.15s has gone: plug the adapter in again, or load its driver", name);
-	else if (error == ENETDOWN)
-		snprintf(ret, 160, "%.15s was set down: `ip link set %.15s up`, or look why the system did it", name,
-		         name);
-	else if (error == EINVAL || error == EMSGSIZE)
-		snprintf(ret, 160, "%.15s does not take this frame: CAN FD needs `ip link set %.15s mtu 72`", name,
-		         name);
-	else
-		snprintf(ret, 160, "%.15s: %s", name, strerror(error));
+	can_words_end(link->connect, error, ret);
 }
 
 void can_link_note(const struct link *link, char ret[160])

@@ -6,22 +6,27 @@
  *     |                                                                                                        v
  *     +------------------------ what every beam truly hit -----------------------------------------------> compared
  *
- * Only link_* of a driver is replaced. A virtual link does to bytes what transports do: it is pulled out and put back,
- * refuses, hangs, is reset, is half open, splits, joins, and takes what it is given a byte at a time. Servo and poses
- * are fed as the records that their own drivers decode. Runs are the same bytes every time. Times in the interface are
- * ns since the start. Everything that goes wrong in making a rig ends the program with a sentence: it serves tests. */
+ * Only link_* of a driver is replaced (for CAN and Modbus can_link.c and modbus_bus.c, behind the driver's own functions).
+ * A virtual link does to bytes what transports do: it is pulled out and put back, refuses, hangs, is reset, is half open,
+ * splits, joins, and takes what it is given a byte at a time; a virtual bus lets frames wait for each other, stamps them,
+ * loses them. Servos and poses behind which no simulated device stands are fed as the records that their own drivers
+ * decode. Runs are the same bytes every time. Times in the interface are ns since the start. Everything that goes wrong in
+ * making a rig ends the program with a sentence: it serves tests. */
 #ifndef FACET_TESTS_RIG_H
 #define FACET_TESTS_RIG_H
 
-#include "daemon/pipeline.h"
+#include "daemon/journal.h"
 #include "daemon/supervisor.h"
 #include "tools/sim_device.h"
+#include "tools/sim_drive.h"
 
 #define RIG_MS     INT64_C(1000000)
 #define RIG_SECOND INT64_C(1000000000)
 #define RIG_NEAR_M 0.05
 
-enum rig_transport { RIG_SERIAL, RIG_TCP, RIG_USB };
+/* RIG_CAN: bytes of the brain are entries of can_wire.h, both ways; devices with one `connect` share a bus.
+ * RIG_MODBUS: a line where `connect` is a path, else TCP; the bus asks as modbus_bus.c does. */
+enum rig_transport { RIG_SERIAL, RIG_TCP, RIG_USB, RIG_CAN, RIG_MODBUS };
 
 /* Faults of a link, beside those of the brain behind it:
  *   "unplug"       SERIAL, USB: lost, and cannot be opened; TCP: no byte passes, the connection is dead when it is back
@@ -37,7 +42,8 @@ enum rig_transport { RIG_SERIAL, RIG_TCP, RIG_USB };
  * and of the world around, whatever the device:
  *   "wall clock"   it is now so many seconds ahead of log time, for those who send it
  *   "late angles"  samples of the servo come so many ms late
- *   "no angles"    they do not come at all */
+ *   "no angles"    they do not come at all
+ *   "no poses"     nobody says where the robot is */
 
 struct rig_params {
 	const char *yaml;  /* the devices; a modbus device is the servo, a pose device the localisation */
@@ -46,6 +52,7 @@ struct rig_params {
 	int thin;         /* every n-th beam is cast, those behind it repeat it; 0, 1: every one */
 	int64_t delay_ns; /* of the lines: every piece of bytes is late by a tenth of it up to all of it; 0: 300 us */
 	bool stand;       /* the robot does not drive */
+	int64_t pose_ns;  /* between poses that are fed; 0: 10 ms */
 };
 
 struct rig;
@@ -57,8 +64,24 @@ int rig_find(const struct rig *, const char *device); /* its index */
 void rig_scene(struct rig *, const char *device, struct scene *ret);
 int64_t rig_epoch_ns(const struct rig *);          /* brains are made with this time */
 double rig_tilt(const struct rig *, int64_t t_ns); /* the true angle of the servo, at a brain's time */
+/* True place of the robot at a brain's time, for its wheels. */
+struct transform rig_base(struct rig *, int64_t t_ns);
+/* The scanners tilt with a simulated axis from now on, whose angle in the sense of the tilt frame `angle` tells. */
+void rig_follow(struct rig *, double (*angle)(void *ctx, int64_t t_ns), void *ctx);
 /* The device's other end; the brain is the rig's from now on. */
 void rig_attach(struct rig *, const char *device, enum rig_transport, const struct sim_device *brain);
+void rig_attach_drive(struct rig *, const char *device, struct sim_drive *); /* RIG_MODBUS: it speaks in transactions */
+
+/* Whoever wants what comes of it, from the start on. Rows are taken over by `row` after they were compared. */
+struct rig_keeper {
+	void *ctx;
+	void (*row)(void *ctx, struct row *row);                             /* may be NULL */
+	void (*flush)(void *ctx);                                            /* may be NULL */
+	void (*tilt)(void *ctx, int device, double angle_rad, int64_t t_ns); /* an angle as decoded; may be NULL */
+	struct journal_sink journal;                                         /* `begin` NULL: no list is kept */
+};
+void rig_keep(struct rig *, const struct rig_keeper *);
+void rig_new_map(struct rig *); /* rows are numbered anew, and so is the list */
 
 void rig_start(struct rig *);
 void rig_run(struct rig *, int64_t for_ns);

@@ -141,6 +141,7 @@ struct driver {
 extern const struct driver *const driver_table[];
 const struct driver *driver_find(const char *name); /* NULL: unknown */
 
-extern const struct driver driver_lms2xx, driver_modbus, driver_pose, driver_tim, driver_lms1xx, driver_lms5xx;
+extern const struct driver driver_lms2xx, driver_modbus, driver_pose, driver_tim, driver_lms1xx, driver_lms5xx,
+    driver_can;
 
 #endif

@@ -49,7 +49,16 @@ refused 2 '--http: not yet' hall --http 127.0.0.1:1
 refused 2 'world moves continuously' hall --speed 2
 refused 2 'world moves continuously' building --speed max
 refused 2 'neither max nor a number' hall --speed fast
-refused 2 'neither rtu nor tcp' hall --servo can
+refused 2 'none of modbus, modbus-tcp, can, canopen' hall --servo cam
+refused 2 'paced by the answers of a servo behind Modbus' uos:/nowhere --servo can
+refused 2 '--odometry and --truth are for worlds' uos:/nowhere --odometry
+refused 2 'neither wheels nor speed' hall --odometry=legs
+refused 2 'nothing here is on a CAN bus' hall --can can1
+refused 2 'no CAN interface' hall --servo can --can can1:
+refused 2 'nothing to count' hall --laser lms1xx --encoder --servo fixed
+refused 1 "'smoke': can has no such fault; it has bus-off, .*down, deleted" hall --servo can --fault 'can: smoke'
+refused 1 "no such device; there is laser, servo, can, odometry, pose" hall --servo can --odometry --fault 'radar: garbage'
+refused 1 '--truth /nowhere/truth: No such file' hall --truth /nowhere/truth
 refused 2 'whole number' hall --seed -3
 refused 2 'oopback' hall --tcp 0.0.0.0:7878
 refused 2 'which COMMAND' hall --

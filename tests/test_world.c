@@ -177,6 +177,16 @@ static struct profile fan(int64_t t_ns)
 	                        .step_rad = 0.5 * TRIG_DEG};
 }
 
+static double servo_angle(void *ctx, int64_t t_ns)
+{
+	return sim_servo_angle(ctx, t_ns);
+}
+
+static void join(struct stage *stage, struct sim_servo *servo)
+{
+	stage->join(stage->ctx, &(struct stage_axis){servo, servo_angle}, servo);
+}
+
 static void the_noise_of_a_seed_is_the_same_at_every_run_and_within_15_mm(void **state)
 {
 	struct sim_servo_params params = {.tcp = "127.0.0.1:0", .slave = 1};
@@ -190,7 +200,7 @@ static void the_noise_of_a_seed_is_the_same_at_every_run_and_within_15_mm(void *
 	assert_non_null(servo);
 	for (int i = 0; i < 3; i++) {
 		assert_int_equal(drive_stage("hall", i < 2 ? 5 : 6, &stage, error), 0);
-		stage.join(stage.ctx, servo);
+		join(&stage, servo);
 		p[i] = fan(1000 + i);
 		stage.scene.scan(stage.ctx, &p[i]);
 		stage.destroy(stage.ctx);
@@ -214,7 +224,7 @@ static void a_profile_costs_little(void **state)
 
 	(void)state;
 	assert_int_equal(drive_stage("building", 1, &stage, error), 0);
-	stage.join(stage.ctx, servo);
+	join(&stage, servo);
 	begin = clock();
 	for (int i = 0; i < 1000; i++) {
 		p.t_ns = i * INT64_C(40000000);

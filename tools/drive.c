@@ -20,7 +20,7 @@
 
 struct drive {
 	struct world *world;
-	struct sim_servo *servo;
+	struct stage_axis axis;
 	uint64_t seed, beams;
 	bool started, endless;
 	int64_t start_ns;
@@ -58,7 +58,7 @@ static struct transform laser_at(struct drive *d, int64_t t_ns)
 {
 	struct pose pose = pose_at(d, t_ns);
 	struct transform map_base = transform_quat(pose.position_m, pose.rotation), base_axis = transform_identity();
-	struct transform tilt = transform_tilt(-sim_servo_angle(d->servo, t_ns)), axis_laser = transform_identity(), t;
+	struct transform tilt = transform_tilt(-d->axis.angle(d->axis.ctx, t_ns)), axis_laser = transform_identity(), t;
 
 	base_axis.t = (struct vec3){AHEAD_M, 0.0, HEIGHT_M};
 	axis_laser.t.z = MIRROR_M;
@@ -99,9 +99,10 @@ static bool ended(void *ctx, int64_t t_ns, char said[80])
 	return true;
 }
 
-static void join(void *ctx, struct sim_servo *servo)
+static void join(void *ctx, const struct stage_axis *axis, struct sim_servo *servo)
 {
-	((struct drive *)ctx)->servo = servo;
+	(void)servo;
+	((struct drive *)ctx)->axis = *axis;
 }
 
 static void destroy(void *ctx)

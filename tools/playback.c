@@ -535,10 +535,11 @@ static bool stage_ended(void *ctx, int64_t t_ns, char said[80])
 	return true;
 }
 
-static void stage_join(void *ctx, struct sim_servo *servo)
+static void stage_join(void *ctx, const struct stage_axis *axis, struct sim_servo *servo)
 {
 	struct theatre *t = ctx;
 
+	(void)axis;
 	t->servo = servo;
 	playback_placed(t->playback, seen_by(t));
 }

@@ -1,6 +1,7 @@
-/* Joins simulated devices and a stage: the scanner on DIR/laser (or on TCP), the servo on DIR/servo (or on TCP), poses at
- * 100 Hz to DIR/pose.sock, and DIR/facetd.yaml, which reaches them all and lets the daemon listen on DIR/facetd.sock.
- * Faults are ordered at DIR/simulator.sock.
+/* Joins simulated devices and a stage: the scanner on DIR/laser (or on TCP), the servo on DIR/servo (or on TCP, or on a CAN
+ * bus: scenario_motion.c), poses at 100 Hz to DIR/pose.sock (at 1 Hz where the wheels tell the motion), and
+ * DIR/facetd.yaml, which reaches them all and lets the daemon listen on DIR/facetd.sock. Faults are ordered at
+ * DIR/simulator.sock.
  *
  * A pose goes out with the time it is true for, in CLOCK_REALTIME as it is then, as any localisation would stamp it: a
  * wall clock that is set is followed. A datagram that nobody takes (no daemon yet, its queue full) is not sent again: the
@@ -20,37 +21,37 @@
 #include "daemon/wall_clock.h"
 #include "drivers/pose_line.h"
 #include "tools/output.h"
+#include "tools/scenario_motion.h"
+#include "tools/scenario_truth.h"
 #include "tools/sim_control.h"
 #include "tools/sim_gadget.h"
 
 #define POSE_MS  10
-#define UNIT     1    /* of the servo */
+#define RARE_NS  INT64_C(1000000000) /* between poses beside an odometry */
+#define JUMP_M   0.5
 #define LASER_BD 9600 /* as from the factory */
 #define MODE_15  0x05
-#define YAML_MAX 4096
-#define TICK_DEG 0.01 /* of the encoder in a scanner's telegrams */
 
-static const struct {
-	const char *driver;
-	enum sim_cola_model_id model; /* not of the LMS2xx */
-	int range_m;
-	bool encoder;
-} lasers[SCENARIO_LASERS] = {[SCENARIO_LMS2XX] = {"lms2xx", SIM_COLA_MODELS, 30, false},
-                             [SCENARIO_TIM] = {"tim", SIM_TIM571, 25, false},
-                             [SCENARIO_LMS1XX] = {"lms1xx", SIM_LMS111, 20, true},
-                             [SCENARIO_LMS5XX] = {"lms5xx", SIM_LMS511, 30, true}};
+/* Of scanners with CoLa. */
+static const enum sim_cola_model_id models[SCENARIO_LASERS] = {[SCENARIO_LMS2XX] = SIM_COLA_MODELS,
+                                                               [SCENARIO_TIM] = SIM_TIM571,
+                                                               [SCENARIO_LMS1XX] = SIM_LMS111,
+                                                               [SCENARIO_LMS5XX] = SIM_LMS511};
 
 struct scenario {
 	struct scenario_params params;
 	struct stage stage;
-	struct sim_servo *servo;
-	struct sim_device laser; /* the shell's; to be asked what it did */
+	struct scenario_motion *motion;
+	struct scenario_truth *truth; /* NULL: not asked for */
+	struct sim_device laser;      /* the shell's; to be asked what it did */
 	struct sim_pty *laser_pty;
 	struct sim_tcp *laser_tcp;
 	struct sim_gadget *laser_usb;
 	struct sim_control *control;
-	struct fault_target target[3];
-	bool mute; /* a fault: poses are not sent */
+	struct fault_target target[2 + SCENARIO_MOTION_TARGETS];
+	bool mute;       /* a fault: poses are not sent */
+	double jump_m;   /* another: they are so far off, along x */
+	int64_t pose_ns; /* the next one is due */
 	uv_timer_t *timer;
 	int pose_fd;
 	struct sockaddr_un pose_address;
@@ -65,84 +66,11 @@ bool scenario_is_world(const char *name)
 
 /* ---- the configuration ---- */
 
-static int print_servo(const struct scenario_params *params, bool sweeps, int port, char *ret, size_t cap)
-{
-	char connect[160];
-
-	if (port)
-		snprintf(connect, sizeof connect, "127.0.0.1:%d", port);
-	else
-		snprintf(connect, sizeof connect, "%.140s/servo", params->dir);
-	/* A played recording waits for the servo's answers at every line, so it is polled faster. */
-	return snprintf(ret, cap,
-	                "  - {name: servo, driver: modbus, connect: \"%s\", parity: none, unit: %d, period: %s,\n"
-	                "     position: {function: 3, address: %d, type: i32, scale: 0.001deg, sign: -1},\n"
-	                "     target: {function: 16, address: %d, type: i32, scale: 0.001deg, sign: -1},\n"
-	                "     speed: {function: 16, address: %d, type: u32, scale: 0.001deg}}\n",
-	                connect, UNIT, sweeps ? "5ms" : "2ms", SIM_SERVO_POSITION, SIM_SERVO_TARGET, SIM_SERVO_SPEED);
-}
-
-enum scenario_laser scenario_laser(const char *driver)
-{
-	int i = 0;
-
-	while (i < SCENARIO_LASERS && strcmp(lasers[i].driver, driver) != 0)
-		i++;
-	return (enum scenario_laser)i;
-}
-
-static int print_laser(const struct scenario_params *params, int port, char *ret, size_t cap)
-{
-	const char *driver = lasers[params->laser].driver;
-	char encoder[80] = "", connect[32] = "usb";
-
-	if (params->encoder) /* the servo's sense: up is positive */
-		snprintf(encoder, sizeof encoder, " encoder: {scale: %gdeg, sign: -1},", TICK_DEG);
-	if (params->laser == SCENARIO_LMS2XX)
-		return snprintf(ret, cap,
-		                "  - {name: laser, driver: %s, port: \"%s/laser\", baud: 500000, variant: 180/0.5,\n"
-		                "     range: [0.3, %d], tilt: servo}\n",
-		                driver, params->dir, lasers[params->laser].range_m);
-	if (!params->usb)
-		snprintf(connect, sizeof connect, "127.0.0.1:%d", port);
-	return snprintf(ret, cap, "  - {name: laser, driver: %s, connect: \"%s\",%s range: [0.3, %d], tilt: %s}\n",
-	                driver, connect, encoder, lasers[params->laser].range_m, params->encoder ? "laser" : "servo");
-}
-
-int scenario_yaml(const struct scenario_params *params, bool sweeps, int servo_port, int laser_port, char *ret,
-                  size_t cap)
-{
-	const char *dir = params->dir;
-	char laser[512], servo[1024];
-
-	print_laser(params, laser_port, laser, sizeof laser);
-	print_servo(params, sweeps, servo_port, servo, sizeof servo);
-	/* A recording has every ray through one point; a played line waits for its reader, so its reader may wait too. */
-	int n =
-	    snprintf(ret, cap,
-	             "# Written by `facet simulate %s`: reaches its simulated devices.\n"
-	             "%s"
-	             "devices:\n"
-	             "%s"
-	             "%s"
-	             "  - {name: pose, driver: pose, listen: \"unix:%s/pose.sock\"}\n"
-	             "%s"
-	             "listen: {native: [\"unix:%s/facetd.sock\"%s%s%s]}\n",
-	             scenario_is_world(params->name) ? params->name : "...",
-	             sweeps ? "mount: {base_tilt: {xyz: [0.2, 0, 0.4]}, tilt_laser: {xyz: [0, 0, 0.05]}}\n"
-	                    : "map: {hold: 1s}\n",
-	             laser, servo, dir,
-	             sweeps ? "sweep: {device: servo, from: -65deg, to: 45deg, speed: 30deg, profile: triangle}\n" : "",
-	             dir, params->tcp ? ", \"tcp:" : "", params->tcp ? params->tcp : "", params->tcp ? "\"" : "");
-
-	return n < 0 || (size_t)n >= cap ? -ENOSPC : n;
-}
-
 static int write_yaml(const struct scenario *s, char error[SCENARIO_ERROR_MAX])
 {
-	char yaml[YAML_MAX], path[128];
+	char yaml[SCENARIO_YAML_MAX], path[128];
 	struct output_error why;
-	int n = scenario_yaml(&s->params, s->stage.sweeps, sim_servo_port(s->servo),
+	int n = scenario_yaml(&s->params, s->stage.sweeps, scenario_motion_port(s->motion),
 	                      s->laser_tcp ? sim_tcp_port(s->laser_tcp) : 0, yaml, sizeof yaml);
 
 	if (n < 0) {
@@ -162,12 +90,10 @@ static void send_pose(struct scenario *s, int64_t now_ns)
 {
 	struct pose pose = s->stage.pose(s->stage.ctx, now_ns);
 	char line[POSE_LINE_MAX];
-	int64_t offset_ns;
 	int n;
 
-	if (wall_clock_offset(&offset_ns))
-		s->realtime_ns = offset_ns;
 	pose.t_ns = now_ns + s->realtime_ns;
+	pose.position_m.x += s->jump_m;
 	n = pose_line_print(&pose, line, sizeof line);
 	if (n > 0 &&
 	    sendto(s->pose_fd, line, (size_t)n, MSG_DONTWAIT | MSG_NOSIGNAL, (struct sockaddr *)&s->pose_address,
@@ -180,32 +106,34 @@ static void on_timer(uv_timer_t *timer)
 {
 	struct scenario *s = timer->data;
 	int64_t now_ns = wall_clock_read(CLOCK_MONOTONIC);
+	struct stage_axis axis = scenario_motion_axis(s->motion);
+	int64_t offset_ns;
 	char said[80];
 
-	if (!s->mute)
+	if (wall_clock_offset(&offset_ns))
+		s->realtime_ns = offset_ns;
+	if (now_ns >= s->pose_ns && !s->mute)
 		send_pose(s, now_ns);
+	if (now_ns >= s->pose_ns)
+		s->pose_ns = s->params.odometry == SCENARIO_NO_ODOMETRY ? now_ns : now_ns + RARE_NS;
+	if (s->truth)
+		scenario_truth_write(s->truth, &axis, &s->stage, now_ns, s->realtime_ns);
 	if (s->ended || !s->stage.ended(s->stage.ctx, now_ns, said))
 		return;
 	s->ended = true;
 	s->params.ended(s->params.ctx, said);
 }
 
-static double servo_angle(void *ctx, int64_t t_ns)
-{
-	struct scenario *s = ctx;
-
-	return sim_servo_angle(s->servo, t_ns);
-}
-
 static int create_brain(struct scenario *s)
 {
 	const struct sim_lms2xx_params lms = {
 	    .fast = s->params.fast, .baud = LASER_BD, .mode = MODE_15, .millimetres = true};
-	const struct sim_cola_params cola = {.model = lasers[s->params.laser].model,
+	const struct stage_axis axis = scenario_motion_axis(s->motion);
+	const struct sim_cola_params cola = {.model = models[s->params.laser],
 	                                     .segments = !s->params.usb,
-	                                     .ticks_per_rad = 1.0 / (TICK_DEG * TRIG_DEG),
-	                                     .angle = s->params.encoder ? servo_angle : NULL,
-	                                     .ctx = s};
+	                                     .ticks_per_rad = 1.0 / (SCENARIO_TICK_DEG * TRIG_DEG),
+	                                     .angle = s->params.encoder ? axis.angle : NULL,
+	                                     .ctx = axis.ctx};
 	int64_t now_ns = wall_clock_read(CLOCK_MONOTONIC);
 
 	return s->params.laser == SCENARIO_LMS2XX ? sim_lms2xx_create(&lms, &s->stage.scene, now_ns, &s->laser)
@@ -215,9 +143,7 @@ static int create_brain(struct scenario *s)
 static int start_laser(struct scenario *s, uv_loop_t *loop, char error[SCENARIO_ERROR_MAX])
 {
 	const struct sim_gadget_params usb = {
-	    .name = "facet",
-	    .serial = "1",
-	    .title = s->params.usb ? sim_cola_model_name(lasers[s->params.laser].model) : ""};
+	    .name = "facet", .serial = "1", .title = s->params.usb ? sim_cola_model_name(models[s->params.laser]) : ""};
 	char link[128];
 
 	if (create_brain(s) < 0) {
@@ -236,32 +162,40 @@ static int start_laser(struct scenario *s, uv_loop_t *loop, char error[SCENARIO_
 
 static int start_devices(struct scenario *s, uv_loop_t *loop, char error[SCENARIO_ERROR_MAX])
 {
-	char servo[128];
-	struct sim_servo_params servo_params = {.rtu = s->params.tcp_servo ? NULL : servo,
-	                                        .tcp = "127.0.0.1:0",
-	                                        .slave = UNIT,
-	                                        .angle_rad = s->stage.angle_rad};
+	struct stage_axis axis;
 
-	snprintf(servo, sizeof servo, "%.110s/servo", s->params.dir);
-	s->servo = sim_servo_create(&servo_params, error);
-	if (!s->servo)
+	s->motion = scenario_motion_create(loop, &s->params, &s->stage, error);
+	if (!s->motion)
 		return -EIO;
-	s->stage.join(s->stage.ctx, s->servo);
-	return start_laser(s, loop, error);
+	axis = scenario_motion_axis(s->motion);
+	s->stage.join(s->stage.ctx, &axis, scenario_motion_servo(s->motion));
+	if (s->params.truth)
+		s->truth = scenario_truth_create(s->params.truth, wall_clock_read(CLOCK_MONOTONIC), error);
+	return s->params.truth && !s->truth ? -EIO : start_laser(s, loop, error);
 }
 
 /* ---- faults ---- */
 
-static const char *const pose_kinds[] = {"silence", NULL};
+static const char *const pose_kinds[] = {"silence", "jump", NULL};
+
+static void order_poses(struct scenario *s, const struct sim_fault *fault, bool on)
+{
+	double by_m = fault->value != 0.0 ? fault->value : JUMP_M;
+
+	if (!strcmp(fault->kind, "silence"))
+		s->mute = on;
+	else
+		s->jump_m += on ? by_m : -by_m;
+}
 
 static bool order(void *ctx, const struct sim_fault *fault, bool on)
 {
 	struct scenario *s = ctx;
 
 	if (!strcmp(fault->device, "pose"))
-		s->mute = on;
-	else if (!strcmp(fault->device, "servo"))
-		return sim_servo_fault(s->servo, fault, on);
+		order_poses(s, fault, on);
+	else if (strcmp(fault->device, "laser") != 0)
+		return scenario_motion_fault(s->motion, fault, on);
 	else if (s->laser_pty)
 		return sim_pty_fault(s->laser_pty, fault, on);
 	else if (s->laser_usb)
@@ -274,10 +208,12 @@ static bool order(void *ctx, const struct sim_fault *fault, bool on)
 void scenario_status(const struct scenario *s, char *ret, size_t cap)
 {
 	struct sim_counts counts;
-	int n = snprintf(ret, cap, "laser: ");
+	size_t n = (size_t)snprintf(ret, cap, "laser: ");
 
 	s->laser.counts(s->laser.ctx, &counts);
-	fault_print_counts(&counts, ret + n, cap - (size_t)n);
+	fault_print_counts(&counts, ret + n, cap - n);
+	n = strlen(ret);
+	scenario_motion_status(s->motion, wall_clock_read(CLOCK_MONOTONIC), ret + n, cap - n);
 }
 
 static void print_status(void *ctx, char ret[SIM_CONTROL_STATUS_MAX])
@@ -289,15 +225,16 @@ static int start_control(struct scenario *s, uv_loop_t *loop, char error[SCENARI
 {
 	char path[128], why[FAULT_ERROR_MAX];
 	struct sim_control_params params = {
-	    .socket = path, .target = s->target, .targets = 3, .ctx = s, .order = order, .status = print_status};
-	int r = 0;
+	    .socket = path, .target = s->target, .ctx = s, .order = order, .status = print_status};
+	int r = 0, n = 0;
 
 	const char *const *shell = s->laser_pty   ? sim_pty_fault_kinds()
 	                           : s->laser_usb ? sim_gadget_fault_kinds()
 	                                          : sim_tcp_fault_kinds();
-	s->target[0] = (struct fault_target){"laser", {s->laser.fault_kinds, shell}};
-	s->target[1] = (struct fault_target){"servo", {sim_servo_fault_kinds(), NULL}};
-	s->target[2] = (struct fault_target){"pose", {pose_kinds, NULL}};
+	s->target[n++] = (struct fault_target){"laser", {s->laser.fault_kinds, shell}};
+	n += scenario_motion_targets(s->motion, s->target + n);
+	s->target[n++] = (struct fault_target){"pose", {pose_kinds, NULL}};
+	params.targets = n;
 	snprintf(path, sizeof path, "%.110s/simulator.sock", s->params.dir);
 	s->control = sim_control_create(loop, &params, why);
 	for (int i = 0; s->control && !r && i < s->params.faults; i++)
@@ -406,7 +343,8 @@ void scenario_destroy(struct scenario *s)
 		sim_tcp_destroy(s->laser_tcp);
 	if (s->laser_usb)
 		sim_gadget_destroy(s->laser_usb);
-	sim_servo_destroy(s->servo);
+	scenario_motion_destroy(s->motion);
+	scenario_truth_destroy(s->truth);
 	if (s->stage.destroy)
 		s->stage.destroy(s->stage.ctx);
 	if (s->pose_fd >= 0)

@@ -10,13 +10,19 @@
 #define SCENARIO_ERROR_MAX 1024
 
 /* Times are CLOCK_MONOTONIC in ns. */
+struct stage_axis {
+	void *ctx;
+	double (*angle)(void *ctx, int64_t t_ns); /* rad */
+};
+
 struct stage {
 	void *ctx;
 	struct scene scene;
 	double angle_rad; /* where the servo stands at first, in its own sense: positive looks up */
 	bool sweeps;      /* the configuration lets the servo sweep */
-	/* The servo's simulator, once it exists. */
-	void (*join)(void *ctx, struct sim_servo *);
+	/* Where the servo stands, in that sense, once there is one: `angle` at any time of the last seconds. Who plays a
+	 * recording needs the simulator behind Modbus, which is NULL otherwise. */
+	void (*join)(void *ctx, const struct stage_axis *, struct sim_servo *);
 	/* map <- base at t_ns. */
 	struct pose (*pose)(void *ctx, int64_t t_ns);
 	/* A datagram with the pose just asked for was taken by a reader. May be NULL. */
@@ -56,6 +62,17 @@ enum scenario_servo {
 /* By its word of the command line, "canopen-cyclic"; SCENARIO_SERVOS: there is none. */
 enum scenario_servo scenario_servo(const char *word);
 
+const char *scenario_servo_word(enum scenario_servo);
+bool scenario_servo_commanded(enum scenario_servo);
+
+/* What the wheels tell, if anything; poses then come once a second. */
+enum scenario_odometry { SCENARIO_NO_ODOMETRY, SCENARIO_WHEELS, SCENARIO_SPEEDS };
+
+#define SCENARIO_UNIT      1    /* of the servo behind Modbus */
+#define SCENARIO_NODE      5    /* ... on CANopen */
+#define SCENARIO_TICK_DEG  0.01 /* of the encoder in a scanner's telegrams */
+#define SCENARIO_FIXED_DEG 15.0 /* so a scanner without a servo looks down */
+
 /* `truth`: where the axis truly was, as text, a line a millisecond, written while it runs:
  *
  *   T ANGLE X Y Z YAW
@@ -68,18 +85,25 @@ struct scenario_params {
 	int more_n;
 	const char *dir; /* absolute; exists */
 	bool fast;       /* playback without the wire's pace */
-	bool tcp_servo;  /* the servo on TCP instead of a pseudo-terminal */
 	enum scenario_laser laser;
-	bool usb;           /* the scanner on USB: the TiM, as root on a kernel with gadgets */
-	bool encoder;       /* the angle comes in the scanner's telegrams (LMS1xx, LMS5xx) */
-	bool endless;       /* the drive goes there and back again until it is ended */
-	char *const *fault; /* sentences (fault.h) */
+	enum scenario_servo servo;
+	enum scenario_odometry odometry;
+	const char *can;        /* a real interface where the nodes are; NULL: a hub at DIR/can.sock */
+	const char *can_config; /* ... and the one that the configuration names; NULL: the same */
+	const char *truth;      /* file, or NULL */
+	bool usb;               /* the scanner on USB: the TiM, as root on a kernel with gadgets */
+	bool encoder;           /* the angle comes in the scanner's telegrams (LMS1xx, LMS5xx) */
+	bool endless;           /* the drive goes there and back again until it is ended */
+	char *const *fault;     /* sentences (fault.h) */
 	int faults;
 	const char *tcp; /* HOST:PORT where the daemon is to listen too, or NULL */
 	uint64_t seed;
 	void *ctx;
 	void (*ended)(void *ctx, const char *said); /* called once */
 };
+
+/* Is anything on a CAN bus? */
+bool scenario_uses_can(const struct scenario_params *);
 
 /* Is it a world, which goes on by itself (and takes no --speed)? */
 bool scenario_is_world(const char *name);
@@ -93,6 +117,7 @@ void scenario_destroy(struct scenario *);
 /* What the scanner did so far, for the eye of a user: one line without its end. */
 void scenario_status(const struct scenario *, char *ret, size_t cap);
 
+#define SCENARIO_YAML_MAX 4096
 /* The configuration, as it is written. The length, or -ENOSPC. */
 int scenario_yaml(const struct scenario_params *, bool sweeps, int servo_port, int laser_port, char *ret, size_t cap);
 

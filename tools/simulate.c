@@ -38,7 +38,11 @@ struct options {
 	int faults;
 	enum scenario_laser laser;
 	bool encoder, endless;
-	bool fast, tcp_servo, usb;
+	enum scenario_servo servo;
+	enum scenario_odometry odometry;
+	char can[64]; /* --can, cut at its colon: the configuration's interface follows */
+	const char *can_config, *truth;
+	bool fast, usb;
 	double speed;
 	uint64_t seed;
 	char **command; /* NULL: none */
@@ -72,7 +76,10 @@ enum {
 	OPTION_LASER,
 	OPTION_ENCODER,
 	OPTION_USB,
-	OPTION_ENDLESS
+	OPTION_ENDLESS,
+	OPTION_ODOMETRY,
+	OPTION_CAN,
+	OPTION_TRUTH
 };
 
 static const struct argp_option option_list[] = {
@@ -81,7 +88,17 @@ static const struct argp_option option_list[] = {
     {"speed", OPTION_SPEED, "X|max", 0, "max: recorded sweeps without the pace of the wire", 0},
     {"seed", OPTION_SEED, "N", 0, "of the range noise of a world (default 1)", 0},
     {"tcp", OPTION_TCP, "HOST:PORT", 0, "let the daemon listen here too, beside DIR/facetd.sock", 0},
-    {"servo", OPTION_SERVO, "rtu|tcp", 0, "the servo on a pseudo-terminal (default) or on TCP", 0},
+    {"servo", OPTION_SERVO, "KIND", 0,
+     "modbus (default; on a pseudo-terminal), modbus-tcp, canopen, canopen-cyclic, canopen-velocity: facetd commands "
+     "it; "
+     "can, encoder, inclinometer: it moves by itself and tells its angle on CAN; fixed: there is none",
+     0},
+    {"odometry", OPTION_ODOMETRY, "wheels|speed", OPTION_ARG_OPTIONAL,
+     "wheels tell the motion on CAN (what they count, or speed and turn), and poses come once a second", 0},
+    {"can", OPTION_CAN, "IFACE[:OTHER]", 0,
+     "the nodes are on this CAN interface instead of DIR/can.sock, facetd on OTHER (default: the same)", 0},
+    {"truth", OPTION_TRUTH, "FILE", 0,
+     "where axis and robot truly were: a line a millisecond, T (ns), ANGLE, X, Y, Z, YAW", 0},
     {"laser", OPTION_LASER, "lms2xx|tim|lms1xx|lms5xx", 0,
      "which scanner: a LMS2xx on a pseudo-terminal (default), or a TiM571, LMS111, LMS511 on TCP", 0},
     {"usb", OPTION_USB, 0, 0,
@@ -91,8 +108,9 @@ static const struct argp_option option_list[] = {
     {"encoder", OPTION_ENCODER, 0, 0, "the angle comes in the scanner's telegrams (lms1xx, lms5xx)", 0},
     {"endless", OPTION_ENDLESS, 0, 0, "the drive goes there and back again until it is ended", 0},
     {"fault", OPTION_FAULT, "SPEC", 0,
-     "DEVICE: KIND [VALUE] [at TIME] [for TIME|ever], e.g. 'laser: garbage at 3s for 2s'; may be repeated; a wrong "
-     "KIND is answered with those there are",
+     "DEVICE: KIND [VALUE] [at TIME] [for TIME|ever], e.g. 'laser: garbage at 3s for 2s', 'can: bus-off at 3s for 2s'; "
+     "may "
+     "be repeated; a DEVICE or KIND that is wrong is answered with those there are",
      0},
     {"http", OPTION_HTTP, "HOST:PORT", 0, "not yet: the browser page will come later", 0},
     {0},
@@ -133,6 +151,38 @@ static void parse_laser(struct argp_state *state, const char *arg, struct option
 	o->laser = scenario_laser(arg);
 	if (o->laser == SCENARIO_LASERS)
 		argp_error(state, "--laser: '%s' is none of lms2xx, tim, lms1xx, lms5xx", arg);
+}
+
+static void parse_servo(struct argp_state *state, const char *arg, struct options *o)
+{
+	o->servo = scenario_servo(arg);
+	if (o->servo == SCENARIO_SERVOS)
+		argp_error(
+		    state,
+		    "--servo: '%s' is none of modbus, modbus-tcp, can, canopen, canopen-cyclic, canopen-velocity, "
+		    "encoder, inclinometer, fixed",
+		    arg);
+}
+
+static void parse_odometry(struct argp_state *state, const char *arg, struct options *o)
+{
+	o->odometry = arg && !strcmp(arg, "speed") ? SCENARIO_SPEEDS : SCENARIO_WHEELS;
+	if (arg && strcmp(arg, "speed") != 0 && strcmp(arg, "wheels") != 0)
+		argp_error(state, "--odometry: '%s' is neither wheels nor speed", arg);
+}
+
+static void parse_can(struct argp_state *state, const char *arg, struct options *o)
+{
+	char *colon;
+
+	snprintf(o->can, sizeof o->can, "%s", arg);
+	colon = strchr(o->can, ':');
+	if (colon)
+		*colon = '\0';
+	o->can_config = colon ? colon + 1 : o->can;
+	if (!*o->can || strlen(o->can) > 15 || !*o->can_config || strlen(o->can_config) > 15 ||
+	    strlen(arg) >= sizeof o->can || strcspn(arg, "/\"\\ \t\n,{}[]#") != strlen(arg))
+		argp_error(state, "--can: '%s' is no CAN interface, like can1, nor two of them, like can1:can0", arg);
 }
 
 /* Only the form is judged here: what a device can do wrong is known when there is one. */
@@ -178,9 +228,16 @@ static error_t parse_option(int key, char *arg, struct argp_state *state)
 		parse_tcp(state, arg, o);
 		return 0;
 	case OPTION_SERVO:
-		o->tcp_servo = !strcmp(arg, "tcp");
-		if (!o->tcp_servo && strcmp(arg, "rtu"))
-			argp_error(state, "--servo: '%s' is neither rtu nor tcp", arg);
+		parse_servo(state, arg, o);
+		return 0;
+	case OPTION_ODOMETRY:
+		parse_odometry(state, arg, o);
+		return 0;
+	case OPTION_CAN:
+		parse_can(state, arg, o);
+		return 0;
+	case OPTION_TRUTH:
+		o->truth = arg;
 		return 0;
 	case OPTION_FAULT:
 		parse_fault(state, arg, o);
@@ -228,6 +285,7 @@ static const struct argp argp = {
         "for --fault or `status` a line, or the same as JSON, {\"fault\": \"laser: unplug for 2s\"}; each is answered "
         "with one line.\n\n"
         "  facet simulate building -- build/facetd\n"
+        "  facet simulate building --servo canopen --odometry -- build/facetd\n"
         "  facet simulate hall --laser tim --endless --fault 'laser: unplug at 10s for 2s' -- build/facetd",
 };
 
@@ -235,6 +293,14 @@ static void refuse(const char *why)
 {
 	fprintf(stderr, "facet: simulate: %s\n", why);
 	exit(2);
+}
+
+static void check_can(const struct options *o)
+{
+	const struct scenario_params params = {.servo = o->servo, .odometry = o->odometry};
+
+	if (*o->can && !scenario_uses_can(&params))
+		refuse("--can: nothing here is on a CAN bus; choose a --servo that is, or --odometry");
 }
 
 /* What does not go together. */
@@ -248,12 +314,20 @@ static void check(const struct options *o)
 		    "profiles:)");
 	if (!world && o->laser != SCENARIO_LMS2XX)
 		refuse("recorded sweeps are played by a LMS2xx, which waits for its reader: --laser is for worlds");
+	if (!world && o->servo != SCENARIO_MODBUS && o->servo != SCENARIO_MODBUS_TCP)
+		refuse("recorded sweeps are paced by the answers of a servo behind Modbus: other kinds of --servo are "
+		       "for worlds");
+	if (!world && (o->odometry != SCENARIO_NO_ODOMETRY || o->truth))
+		refuse("in recorded sweeps nothing moves by itself: --odometry and --truth are for worlds");
 	if (!world && o->endless)
 		refuse("recorded sweeps end: --endless is for worlds");
 	if (o->usb && o->laser != SCENARIO_TIM)
 		refuse("--usb: only the TiM has a USB port: --laser tim");
 	if (o->encoder && o->laser != SCENARIO_LMS1XX && o->laser != SCENARIO_LMS5XX)
 		refuse("--encoder: only lms1xx and lms5xx have inputs for one");
+	if (o->encoder && o->servo == SCENARIO_FIXED)
+		refuse("--encoder: a scanner that is fixed has nothing to count; choose another --servo");
+	check_can(o);
 }
 
 /* What is behind `--` is COMMAND's and never looked at. */
@@ -503,7 +577,11 @@ static int simulate(struct simulation *s, struct options *o)
 	                                 .more_n = o->more_n,
 	                                 .dir = s->dir,
 	                                 .fast = o->fast,
-	                                 .tcp_servo = o->tcp_servo,
+	                                 .servo = o->servo,
+	                                 .odometry = o->odometry,
+	                                 .can = *o->can ? o->can : NULL,
+	                                 .can_config = o->can_config,
+	                                 .truth = o->truth,
 	                                 .laser = o->laser,
 	                                 .encoder = o->encoder,
 	                                 .usb = o->usb,

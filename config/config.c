@@ -45,10 +45,10 @@ void config_default(struct config *ret)
 		memset(ret, 0, sizeof(*ret)); /* memory is out: an empty configuration maps nothing */
 }
 
-static const struct config_device *pose_device(const struct config *config)
+static const struct config_device *device_of(const struct config *config, unsigned driver)
 {
 	for (int i = 0; i < config->devices; i++)
-		if (keys_driver(config->device[i].driver) == KEY_POSE)
+		if (keys_driver(config->device[i].driver) == driver)
 			return &config->device[i];
 	return NULL;
 }
@@ -56,7 +56,8 @@ static const struct config_device *pose_device(const struct config *config)
 void config_sweep_params(const struct config *config, int device, struct sweep_params *ret)
 {
 	const struct config_device *scanner = &config->device[device];
-	const struct config_device *pose = pose_device(config);
+	const struct config_device *pose = device_of(config, KEY_POSE), *odometry = device_of(config, KEY_ODOMETRY);
+	const bool swept = config->sweep.set && scanner->tilt[0] && strcmp(scanner->tilt, config->sweep.device) == 0;
 	*ret = (struct sweep_params){
 	    .base_tilt = config->mount.base_tilt,
 	    .tilt_laser = config->mount.tilt_laser,
@@ -69,8 +70,10 @@ void config_sweep_params(const struct config *config, int device, struct sweep_p
 	    .hold_ns = config->map.hold_ns,
 	    .fixed_tilt = !scanner->tilt[0],
 	    .tilt_rad = scanner->tilt_fixed_rad,
-	    .fixed_pose = !pose || pose->fixed,
+	    .fixed_pose = pose ? pose->fixed : !odometry,
 	    .map_base = pose && pose->fixed ? pose->fixed_pose : transform_identity(),
+	    .trust_m = odometry ? odometry->trust_m : 0,
+	    .step = swept && config->sweep.profile == SWEEP_STEP,
 	    .raster = (uint32_t)device,
 	};
 	for (int i = 0; i < scanner->masks; i++) {

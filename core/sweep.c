@@ -14,9 +14,12 @@
  * half a row would look like free space next to a wall. Before the first sample there is nothing to go on from.
  *
  * Sweeps. Rows between two turns of the servo are one raster. Noise must not make turns: the angle has to come back by more
- * than TURN_RAD from its extreme. A jump (a fly-back, a robot that went on while rows were dropped) also cuts the raster: no
- * surface may be spanned between rows that were not measured next to each other. After a cut the direction is unknown, so
- * that a fly-back counts once.
+ * than TURN_RAD from its extreme. A jump (a fly-back, a robot that went on while rows were dropped, a map that was moved
+ * under the robot, a servo that was not heard) also cuts the raster: no surface may be spanned between rows that were not
+ * measured next to each other. After a cut the direction is unknown, so that a fly-back counts once.
+ *
+ * Jumps of the pose. Every jump begins a new frame, and nothing lies between poses of two frames: a row is placed in the
+ * frame of its first beam, beyond whose last pose it goes on for 50 ms as beyond the newest.
  *
  * The samples live in rings of fixed size, old ones give way; a sample not newer than the last is ignored, unless it is
  * older by seconds: then the device's time was set back and its ring begins anew. */
@@ -27,6 +30,7 @@
 #include <stdlib.h>
 #include <string.h>
 
+#include "core/mixed.h"
 #include "core/trig.h"
 
 #define FANS                4            /* partial scans of a raster */
@@ -34,6 +38,9 @@
 #define RING                1024         /* samples, a power of two: 1 s at 1 kHz */
 #define SET_BACK_NS         2000000000LL /* older by more than this: time was set back */
 #define POSE_EXTRAPOLATE_NS 50000000LL
+#define POSE_GAP_NS         500000000LL /* and `hold`: between poses that are interpolated */
+#define POSE_STOOD_M        0.02
+#define POSE_STOOD_TURN     1e-5         /* 1 - cosine of half the angle: half a degree */
 #define TWIST_BASE_NS       5000000LL    /* the two poses of a twist are at least so far apart ... */
 #define TWIST_OLDEST_NS     1000000000LL /* ... and no farther than this */
 #define PERIODS             9            /* intervals whose median is the tilt's sample period */
@@ -44,9 +51,6 @@
 #define NEAR_RAD            0.02
 #define SWEEP_ROWS_MAX      2048
 #define LOST_MAX            (1u << 20) /* in a snapshot: more would be said one by one for a while */
-#define MIXED_JUMP_M        0.2f
-#define MIXED_LINE_M        0.02
-#define MIXED_RUN_SHARE     0.25f
 
 struct held {
 	struct profile profile;
@@ -58,6 +62,12 @@ struct fan {
 	double first_rad, step_rad;
 	uint32_t n;
 	double (*beam)[2];
+};
+
+/* A pose, and the frame it is in: nothing lies between poses of different frames. */
+struct framed {
+	struct pose pose;
+	uint32_t frame;
 };
 
 /* Samples, each beginning with its time; number i lives at i % RING. Times rise strictly. */
@@ -75,11 +85,15 @@ struct sweep {
 	uint64_t lost;   /* rows lost with profiles that found the ring full, not reported yet */
 
 	struct ring tilt, pose;
+	uint32_t frame;       /* of the newest pose: one more with every jump */
+	uint32_t frame_first; /* what was measured in an earlier one is of another map */
 
 	struct fan fan[FANS]; /* by the number of a partial scan */
 
 	/* The raster so far. */
 	bool started;
+	bool torn; /* the tilt was lost for a while: the next row is no neighbour of the last one */
+	uint32_t last_frame;
 	int direction;
 	double extreme_rad, last_rad;
 	struct vec3 last_origin;
@@ -137,9 +151,14 @@ static const struct tilt *tilt_at(const struct sweep *s, uint64_t i)
 	return ring_at(&s->tilt, i);
 }
 
-static const struct pose *pose_at(const struct sweep *s, uint64_t i)
+static const struct framed *framed_at(const struct sweep *s, uint64_t i)
 {
 	return ring_at(&s->pose, i);
+}
+
+static const struct pose *pose_at(const struct sweep *s, uint64_t i)
+{
+	return &framed_at(s, i)->pose;
 }
 
 struct sweep *sweep_create(const struct sweep_params *params)
@@ -149,7 +168,7 @@ struct sweep *sweep_create(const struct sweep_params *params)
 		return NULL;
 	s->params = *params;
 	s->held = calloc(SWEEP_PROFILES_WAITING_MAX, sizeof *s->held);
-	bool good = s->held && ring_init(&s->tilt, sizeof(struct tilt)) && ring_init(&s->pose, sizeof(struct pose));
+	bool good = s->held && ring_init(&s->tilt, sizeof(struct tilt)) && ring_init(&s->pose, sizeof(struct framed));
 	for (int i = 0; i < FANS; i++) {
 		s->fan[i].beam = malloc(PROFILE_BEAMS_MAX * sizeof *s->fan[i].beam);
 		good &= s->fan[i].beam != NULL;
@@ -193,8 +212,9 @@ void sweep_stats(const struct sweep *s, struct sweep_stats *ret)
 
 const char *sweep_drop_name(enum sweep_drop drop)
 {
-	static const char *const names[SWEEP_DROPS] = {"no tilt", "stale tilt", "no pose", "stale pose",
-	                                               "too many profiles waiting"};
+	static const char *const names[SWEEP_DROPS] = {
+	    "no tilt", "stale tilt",     "no pose",        "stale pose", "too many profiles waiting",
+	    "moved",   "uncertain pose", "before the jump"};
 	return drop < SWEEP_DROPS ? names[drop] : "unknown";
 }
 
@@ -243,7 +263,18 @@ void sweep_tilt(struct sweep *s, const struct tilt *sample)
 
 void sweep_pose(struct sweep *s, const struct pose *sample)
 {
-	ring_put(&s->pose, sample, sample->t_ns);
+	struct framed framed;
+
+	s->frame += sample->jumped;
+	memset(&framed, 0, sizeof framed);
+	framed.pose = *sample;
+	framed.frame = s->frame;
+	ring_put(&s->pose, &framed, sample->t_ns);
+}
+
+void sweep_new_map(struct sweep *s)
+{
+	s->frame_first = s->frame;
 }
 
 /* Median of the newest intervals between tilt samples: neither a pause nor a burst moves it. */
@@ -265,6 +296,8 @@ static int64_t tilt_period_ns(const struct sweep *s)
 struct walk {
 	const struct sweep *s;
 	uint64_t tilt_next, pose_next;           /* first samples later than the time asked for last */
+	uint64_t pose_end;                       /* poses from here on are of another frame than the row's first beam */
+	int64_t pose_gap_ns;                     /* between two samples at most, unless the robot stood */
 	int64_t tilt_limit_ns;                   /* beyond the last tilt sample up to here */
 	int64_t tilt_gap_ns;                     /* between two samples at most, unless the servo stood */
 	double angle_rad, sine, cosine;          /* at the beam placed last */
@@ -273,16 +306,35 @@ struct walk {
 	struct transform map_base;
 };
 
-static void walk_init(struct walk *w, const struct sweep *s, int64_t t_ns)
+/* Readers of files hold for ever. */
+static int64_t held_ns(const struct sweep *s, int64_t ns)
 {
-	*w = (struct walk){.s = s, .tilt_next = ring_after(&s->tilt, t_ns), .pose_next = ring_after(&s->pose, t_ns)};
+	return s->params.hold_ns < INT64_MAX - ns ? s->params.hold_ns + ns : INT64_MAX;
+}
+
+/* The frame of the pose before t_ns, and where the poses of that frame end. */
+static uint32_t frame_at(const struct sweep *s, int64_t t_ns, uint64_t *ret_end)
+{
+	uint64_t i = ring_after(&s->pose, t_ns);
+	uint32_t frame = i > s->pose.begin ? framed_at(s, i - 1)->frame : s->frame;
+	while (i < s->pose.end && framed_at(s, i)->frame == frame)
+		i++;
+	*ret_end = i;
+	return frame;
+}
+
+/* A row lies in one frame, that of its first beam, at `row_ns`: half a row moved against the other half is no row. */
+static void walk_init(struct walk *w, const struct sweep *s, int64_t row_ns, int64_t t_ns)
+{
+	*w = (struct walk){.s = s, .tilt_next = ring_after(&s->tilt, t_ns)};
 	int64_t period_ns = tilt_period_ns(s);
 	w->tilt_limit_ns = period_ns + period_ns / 2;
-	w->tilt_gap_ns = w->tilt_limit_ns; /* readers of files hold for ever */
-	if (s->params.hold_ns < INT64_MAX - w->tilt_limit_ns)
-		w->tilt_gap_ns += s->params.hold_ns;
-	else
-		w->tilt_gap_ns = INT64_MAX;
+	w->tilt_gap_ns = held_ns(s, w->tilt_limit_ns);
+	w->pose_gap_ns = held_ns(s, POSE_GAP_NS);
+	frame_at(s, row_ns, &w->pose_end);
+	w->pose_next = ring_after(&s->pose, t_ns);
+	if (w->pose_next > w->pose_end)
+		w->pose_next = w->pose_end;
 	w->map_base = s->params.map_base;
 }
 
@@ -334,14 +386,21 @@ static bool pose_equal(const struct pose *a, const struct pose *b)
 	       a->position_m.z == b->position_m.z && p->w == q->w && p->x == q->x && p->y == q->y && p->z == q->z;
 }
 
-/* The last pose, moved on with the twist from an earlier one. */
-static struct transform pose_beyond(const struct sweep *s, int64_t t_ns)
+static bool pose_stood(const struct pose *a, const struct pose *b)
 {
-	const struct pose *last = pose_at(s, s->pose.end - 1);
-	for (uint64_t i = s->pose.end - 1; i > s->pose.begin; i--) {
+	const struct quat *p = &a->rotation, *q = &b->rotation;
+	double dot = fabs(p->w * q->w + p->x * q->x + p->y * q->y + p->z * q->z); /* cosine of half the angle */
+	return vec3_norm(vec3_sub(a->position_m, b->position_m)) <= POSE_STOOD_M && dot >= 1 - POSE_STOOD_TURN;
+}
+
+/* The last pose before `end`, moved on with the twist from an earlier one of its frame. */
+static struct transform pose_beyond(const struct sweep *s, uint64_t end, int64_t t_ns)
+{
+	const struct pose *last = pose_at(s, end - 1);
+	for (uint64_t i = end - 1; i > s->pose.begin; i--) {
 		const struct pose *earlier = pose_at(s, i - 1);
 		int64_t apart_ns = last->t_ns - earlier->t_ns;
-		if (apart_ns > TWIST_OLDEST_NS)
+		if (apart_ns > TWIST_OLDEST_NS || framed_at(s, i - 1)->frame != framed_at(s, end - 1)->frame)
 			break;
 		if (apart_ns >= TWIST_BASE_NS)
 			return pose_between(earlier, last, t_ns);
@@ -355,18 +414,23 @@ static int walk_pose(struct walk *w, int64_t t_ns)
 	const struct sweep *s = w->s;
 	if (s->params.fixed_pose)
 		return 0;
-	while (w->pose_next < s->pose.end && pose_at(s, w->pose_next)->t_ns <= t_ns)
+	while (w->pose_next < w->pose_end && pose_at(s, w->pose_next)->t_ns <= t_ns)
 		w->pose_next++;
 	if (w->pose_next == s->pose.begin)
 		return 1 + SWEEP_NO_POSE;
 	const struct pose *before = pose_at(s, w->pose_next - 1);
-	if (w->pose_next == s->pose.end) {
+	if (s->params.trust_m > 0 && before->variance_m2 > s->params.trust_m * s->params.trust_m)
+		return 1 + SWEEP_UNCERTAIN_POSE;
+	if (w->pose_next == w->pose_end) {
 		if (t_ns - before->t_ns > POSE_EXTRAPOLATE_NS)
 			return 1 + SWEEP_STALE_POSE;
-		w->map_base = pose_beyond(s, t_ns);
+		w->map_base = pose_beyond(s, w->pose_end, t_ns);
 		return 0;
 	}
 	const struct pose *after = pose_at(s, w->pose_next);
+	/* In so long a silence the robot may have been anywhere. */
+	if (after->t_ns - before->t_ns > w->pose_gap_ns && !pose_stood(before, after))
+		return 1 + SWEEP_STALE_POSE;
 	w->map_base = pose_equal(before, after) ? transform_quat(before->position_m, before->rotation)
 	                                        : pose_between(before, after, t_ns);
 	return 0;
@@ -509,7 +573,7 @@ static void judge_beams(const struct sweep_params *params, struct row *row, floa
 		else if (params->masks && is_masked(params, row->first_rad + i * row->step_rad))
 			state[i] = BEAM_MASKED;
 	}
-	sweep_mark_mixed(range_m, state, row->n, row->first_rad, row->step_rad);
+	mixed_mark(range_m, state, row->n, row->step_rad);
 	for (uint32_t i = 0; i < row->n; i++) {
 		row->beam[i].range_m = range_m[i];
 		row->beam[i].state = state[i];
@@ -585,7 +649,7 @@ static void copy_beams(const struct sweep_params *params, const struct recipe *r
 	judge_beams(params, row, range_m, state);
 }
 
-/* Places the beams of one turn of the mirror. 0, or 1 + enum sweep_drop. */
+/* Places the beams of one turn of the mirror in the row. 0, or 1 + enum sweep_drop. */
 static int place_turn(struct sweep *s, const struct source *source, struct row *row)
 {
 	const struct profile *p = source->profile;
@@ -593,7 +657,7 @@ static int place_turn(struct sweep *s, const struct source *source, struct row *
 	int interlace = interlace_of(p);
 	uint32_t k = (uint32_t)source->turn, at = source->first;
 	struct walk walk;
-	walk_init(&walk, s, beam_time_ns(p, interlace, k));
+	walk_init(&walk, s, row->t_ns, beam_time_ns(p, interlace, k));
 	for (uint32_t i = 0; i < source->n; i++, k += (uint32_t)interlace, at += source->stride) {
 		int r = place_beam(&walk, beam_time_ns(p, interlace, k), fan->beam[k], &row->beam[at]);
 		if (r)
@@ -605,12 +669,12 @@ static int place_turn(struct sweep *s, const struct source *source, struct row *
 }
 
 /* Does this row begin a sweep? Keeps the servo's direction. */
-static bool turn_seen(struct sweep *s, const struct row *row)
+static bool turn_seen(struct sweep *s, const struct row *row, uint32_t frame)
 {
 	double angle = row->tilt_rad, back = s->direction * (s->extreme_rad - angle);
 	struct vec3 moved = vec3_sub(row->beam[0].origin, s->last_origin);
-	bool cut = !s->started || fabs(angle - s->last_rad) > CUT_RAD || vec3_norm(moved) > CUT_M ||
-	           s->sweep_rows >= SWEEP_ROWS_MAX || (s->direction && back > TURN_RAD);
+	bool cut = !s->started || s->torn || frame != s->last_frame || fabs(angle - s->last_rad) > CUT_RAD ||
+	           vec3_norm(moved) > CUT_M || s->sweep_rows >= SWEEP_ROWS_MAX || (s->direction && back > TURN_RAD);
 	if (cut) {
 		s->direction = 0;
 		s->extreme_rad = angle;
@@ -624,6 +688,8 @@ static bool turn_seen(struct sweep *s, const struct row *row)
 		s->extreme_rad = angle;
 	}
 	s->started = true;
+	s->torn = false;
+	s->last_frame = frame;
 	s->last_rad = angle;
 	s->last_origin = row->beam[0].origin;
 	s->sweep_rows++;
@@ -642,12 +708,17 @@ static void count_row(struct sweep *s, const struct row *row)
 static int make_row(struct sweep *s, const struct recipe *recipe, struct row **ret)
 {
 	const struct source *first = &recipe->source[0];
+	const int64_t t_ns = beam_time_ns(first->profile, interlace_of(first->profile), (uint32_t)first->turn);
+	uint64_t end;
+	const uint32_t frame = s->params.fixed_pose ? 0 : frame_at(s, t_ns, &end);
+	if (frame < s->frame_first)
+		return 1 + SWEEP_BEFORE_JUMP;
 	struct row *row = row_create(recipe_beams(recipe));
 	int r = 0;
 	if (!row)
 		return -1;
 	row->raster = s->params.raster;
-	row->t_ns = beam_time_ns(first->profile, interlace_of(first->profile), (uint32_t)first->turn);
+	row->t_ns = t_ns;
 	row->first_rad = recipe->first_rad;
 	row->step_rad = recipe->step_rad;
 	copy_beams(&s->params, recipe, row);
@@ -657,7 +728,7 @@ static int make_row(struct sweep *s, const struct recipe *recipe, struct row **r
 		row_destroy(row);
 		return r;
 	}
-	row->starts_sweep = turn_seen(s, row);
+	row->starts_sweep = turn_seen(s, row, frame);
 	count_row(s, row);
 	*ret = row;
 	return 0;
@@ -701,6 +772,7 @@ static int parts_together(const struct sweep *s, int64_t log_ns, bool end)
 static enum sweep_verdict dropped(struct sweep *s, enum sweep_drop drop, enum sweep_drop *ret_drop)
 {
 	s->stats.dropped[drop]++;
+	s->torn |= drop == SWEEP_NO_TILT || drop == SWEEP_STALE_TILT;
 	*ret_drop = drop;
 	return SWEEP_DROPPED;
 }
@@ -721,6 +793,10 @@ enum sweep_verdict sweep_next(struct sweep *s, int64_t log_ns, bool end, struct 
 		int64_t last_ns = last_beam_ns(p);
 		if (!end && !samples_reach(s, last_ns) && log_ns - held->log_ns < s->params.hold_ns)
 			return SWEEP_WAIT;
+		if (s->params.step && !servo_stood(s, p->t_ns, last_ns)) {
+			held_pop(s, 1);
+			return dropped(s, SWEEP_MOVED, ret_drop);
+		}
 		parts = parts_together(s, log_ns, end);
 		if (parts == 0)
 			return SWEEP_WAIT;
@@ -797,7 +873,8 @@ static void tilt_state(struct state *st, void *sample)
 
 static void pose_state(struct state *st, void *sample)
 {
-	struct pose *pose = sample;
+	struct framed *framed = sample;
+	struct pose *pose = &framed->pose;
 	struct quat *q = &pose->rotation;
 	state_time(st, &pose->t_ns);
 	vec3_state(st, &pose->position_m);
@@ -805,6 +882,10 @@ static void pose_state(struct state *st, void *sample)
 	state_double(st, &q->x);
 	state_double(st, &q->y);
 	state_double(st, &q->z);
+	state_double(st, &pose->variance_m2);
+	state_double(st, &pose->variance_rad2);
+	state_bool(st, &pose->jumped);
+	state_u32(st, &framed->frame);
 }
 
 static void ring_state(struct state *st, struct ring *ring, void (*sample_state)(struct state *, void *sample))
@@ -822,6 +903,13 @@ static void ring_state(struct state *st, struct ring *ring, void (*sample_state)
 static void raster_state(struct state *st, struct sweep *s)
 {
 	int rows = (int)s->sweep_rows;
+	state_u32(st, &s->frame);
+	state_u32(st, &s->frame_first);
+	state_u32(st, &s->last_frame);
+	st->failed |= st->loading && (s->frame_first > s->frame || s->last_frame > s->frame);
+	for (uint64_t i = s->pose.begin; i < s->pose.end && st->loading && !st->failed; i++)
+		st->failed = framed_at(s, i)->frame > (i + 1 < s->pose.end ? framed_at(s, i + 1)->frame : s->frame);
+	state_bool(st, &s->torn);
 	state_bool(st, &s->started);
 	state_int(st, &s->direction, -1, 1);
 	state_double(st, &s->extreme_rad);
@@ -844,7 +932,7 @@ static void stats_state(struct state *st, struct sweep_stats *stats)
 
 static void fields_state(struct state *st, struct sweep *s)
 {
-	state_tag(st, "sweep1");
+	state_tag(st, "sweep2");
 	waiting_state(st, s);
 	ring_state(st, &s->tilt, tilt_state);
 	ring_state(st, &s->pose, pose_state);
@@ -872,55 +960,4 @@ void sweep_state(struct state *st, struct sweep *s)
 	*s = *aside;
 	*aside = before;
 	sweep_destroy(aside);
-}
-
-static bool is_valid(uint8_t state)
-{
-	return state == BEAM_OK || state == BEAM_MIXED; /* BEAM_MIXED here: was BEAM_OK before this pass */
-}
-
-/* Do beams first .. first + 3 lie within 2 cm of the line through the outer two? Place of a beam in the plane of the fan. */
-static bool on_line(const float *range_m, uint32_t first, double step_rad)
-{
-	double x[4], y[4];
-	for (uint32_t i = 0; i < 4; i++) {
-		double bearing = i * step_rad; /* where the fan begins does not matter to a line */
-		x[i] = (double)range_m[first + i] * trig_cos(bearing);
-		y[i] = (double)range_m[first + i] * trig_sin(bearing);
-	}
-	double dx = x[3] - x[0], dy = y[3] - y[0], length = sqrt(dx * dx + dy * dy);
-	for (int i = 1; i < 3; i++)
-		if (fabs(dx * (y[i] - y[0]) - dy * (x[i] - x[0])) > MIXED_LINE_M * length)
-			return false;
-	return true;
-}
-
-/* Does the range run on from `a` over `b` to the fourth, `c`, as it does along a wall? A step of next to nothing before a
- * jump is the edge of something near: close to the scanner beams lie within 2 cm of each other, and of any radial line. */
-static bool runs_on(float a, float b, float c)
-{
-	return (b - a) * (c - b) > 0 && fabsf(c - b) >= MIXED_RUN_SHARE * fabsf(b - a);
-}
-
-/* One surface, seen at a slant: the range runs one way through i, and a fourth neighbour is on the line too. */
-static bool is_slanted(const float *r, const uint8_t *state, uint32_t n, uint32_t i, double step_rad)
-{
-	if ((r[i] - r[i - 1]) * (r[i + 1] - r[i]) <= 0)
-		return false;
-	return (i >= 2 && is_valid(state[i - 2]) && runs_on(r[i], r[i - 1], r[i - 2]) && on_line(r, i - 2, step_rad)) ||
-	       (i + 2 < n && is_valid(state[i + 2]) && runs_on(r[i], r[i + 1], r[i + 2]) &&
-	        on_line(r, i - 1, step_rad));
-}
-
-void sweep_mark_mixed(const float *range_m, uint8_t *state, uint32_t n, double first_rad, double step_rad)
-{
-	(void)first_rad;
-	for (uint32_t i = 1; i + 1 < n; i++) {
-		if (state[i] != BEAM_OK || !is_valid(state[i - 1]) || !is_valid(state[i + 1]))
-			continue;
-		bool jumps = fabsf(range_m[i] - range_m[i - 1]) > MIXED_JUMP_M &&
-		             fabsf(range_m[i] - range_m[i + 1]) > MIXED_JUMP_M;
-		if (jumps && !is_slanted(range_m, state, n, i, step_rad))
-			state[i] = BEAM_MIXED;
-	}
 }

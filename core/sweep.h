@@ -28,10 +28,22 @@ struct sweep_params {
 	double tilt_rad;
 	bool fixed_pose; /* no pose device: map <- base holds always */
 	struct transform map_base;
+	double trust_m; /* rows are dropped while the pose's sigma is larger; 0: never */
+	bool step;      /* the servo stands for every profile: one during which it moved is dropped whole */
 	uint32_t raster;
 };
 
-enum sweep_drop { SWEEP_NO_TILT, SWEEP_STALE_TILT, SWEEP_NO_POSE, SWEEP_STALE_POSE, SWEEP_OVERFLOW, SWEEP_DROPS };
+enum sweep_drop {
+	SWEEP_NO_TILT,
+	SWEEP_STALE_TILT,
+	SWEEP_NO_POSE,
+	SWEEP_STALE_POSE,
+	SWEEP_OVERFLOW,
+	SWEEP_MOVED,
+	SWEEP_UNCERTAIN_POSE,
+	SWEEP_BEFORE_JUMP, /* measured in the frame of a map that has ended */
+	SWEEP_DROPS
+};
 
 enum sweep_verdict {
 	SWEEP_WAIT,    /* nothing to hand out now */
@@ -48,6 +60,8 @@ void sweep_destroy(struct sweep *);
 void sweep_profile(struct sweep *, const struct profile *, int64_t log_ns);
 void sweep_tilt(struct sweep *, const struct tilt *);
 void sweep_pose(struct sweep *, const struct pose *);
+/* A new map begins with the newest pose, which jumped: what was measured before it is dropped from here on. */
+void sweep_new_map(struct sweep *);
 
 /* Call after every record (ticks too) with its log time until it answers SWEEP_WAIT. With `end` true nothing is waited
  * for any more (end of an input). */
@@ -63,10 +77,5 @@ void sweep_stats(const struct sweep *, struct sweep_stats *ret);
 /* Snapshot of all that later rows depend on but the parameters. A load that failed leaves the sweep as new. */
 void sweep_state(struct state *, struct sweep *);
 const char *sweep_drop_name(enum sweep_drop);
-
-/* Marks mixed beams of a row of ranges in place (interfaces, section 3): pure, shared with readers of files.
- * A BEAM_OK beam that jumps by more than 20 cm to both its valid neighbours becomes BEAM_MIXED unless the range runs one
- * way through it and these three with one further neighbour, in which the run goes on, lie within 2 cm of a line. */
-void sweep_mark_mixed(const float *range_m, uint8_t *state, uint32_t n, double first_rad, double step_rad);
 
 #endif

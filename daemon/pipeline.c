@@ -1,8 +1,9 @@
 /* The whole system on one screen: how a reading becomes rows of the map (design, section 1).
  *
  *   pipeline_handle              a record goes to its device's decoder;
- *   on_profile, on_tilt, on_pose what the decoder finds goes to the assemblers that need it: a profile to its scanner's,
- *                                an angle to those of the scanners which that device tilts, a pose to all;
+ *   on_profile, on_tilt          what the decoder finds goes to the assemblers that need it: a profile to its scanner's,
+ *                                an angle to those of the scanners which that device tilts;
+ *   on_pose, on_motion           poses and motions go to the robot's track, and its poses to all assemblers;
  *   advance                      every assembler hands out the rows that are complete at this record's log time;
  *   hand_out                     a row gets its number and goes to the sink: the worker's queue, or a map.
  *
@@ -38,6 +39,12 @@ struct scanner {
 struct pipeline {
 	const struct config *config;
 	struct pipeline_sink sink;
+	struct pose_track *track;
+	struct {
+		bool seen;
+		int device;
+		struct pose_jump jump;
+	} jump; /* in the record being handled: the last one of it */
 	struct device device[CONFIG_DEVICES_MAX];
 	struct scanner scanner[CONFIG_DEVICES_MAX];
 	int scanners;
@@ -82,14 +89,35 @@ static void on_tilt(void *ctx, int device, const struct tilt *tilt)
 		p->sink.data(p->sink.ctx, device, p->log_ns);
 }
 
+static void take_track(struct pipeline *p, int device, const struct pose_track_out *out)
+{
+	for (int i = 0; i < p->scanners && out->has_pose; i++)
+		sweep_pose(p->scanner[i].sweep, &out->pose);
+	if (out->has_jump) {
+		p->jump.seen = true;
+		p->jump.device = device;
+		p->jump.jump = out->jump;
+	}
+	if (p->sink.data)
+		p->sink.data(p->sink.ctx, device, p->log_ns);
+}
+
 static void on_pose(void *ctx, int device, const struct pose *pose)
 {
 	struct pipeline *p = ctx;
+	struct pose_track_out out;
 
-	for (int i = 0; i < p->scanners; i++)
-		sweep_pose(p->scanner[i].sweep, pose);
-	if (p->sink.data)
-		p->sink.data(p->sink.ctx, device, p->log_ns);
+	pose_track_absolute(p->track, pose, &out);
+	take_track(p, device, &out);
+}
+
+static void on_motion(void *ctx, int device, const struct motion *motion)
+{
+	struct pipeline *p = ctx;
+	struct pose_track_out out;
+
+	pose_track_motion(p->track, motion, &out);
+	take_track(p, device, &out);
 }
 
 static void on_reply(void *ctx, int device, const struct reply *reply)
@@ -194,11 +222,24 @@ static void advance(struct pipeline *p, bool end)
 		flush(p);
 }
 
+/* What the jump in this record means to what comes. */
+static void settle_jump(struct pipeline *p)
+{
+	if (!p->jump.seen)
+		return;
+	p->jump.seen = false;
+	if (p->jump.jump.done == POSE_TRACK_NEW_MAP)
+		for (int i = 0; i < p->scanners; i++)
+			sweep_new_map(p->scanner[i].sweep);
+	if (p->sink.jump)
+		p->sink.jump(p->sink.ctx, p->jump.device, &p->jump.jump);
+}
+
 /* What the loop calls */
 
 void pipeline_handle(struct pipeline *p, const struct record *record)
 {
-	const struct record_sink found = {p, on_profile, on_tilt, on_pose, on_reply, NULL};
+	const struct record_sink found = {p, on_profile, on_tilt, on_pose, on_reply, on_motion};
 	struct device *device;
 
 	assert(record->device >= 0 && record->device < p->config->devices);
@@ -206,6 +247,7 @@ void pipeline_handle(struct pipeline *p, const struct record *record)
 	p->log_ns = record->log_ns;
 	device->driver->decode(device->decoder, record, &found);
 	advance(p, false);
+	settle_jump(p);
 }
 
 void pipeline_tick(struct pipeline *p, int64_t log_ns)
@@ -337,6 +379,7 @@ static void parts_state(struct state *s, struct pipeline *p)
 		if (can)
 			p->device[i].driver->state(p->device[i].decoder, s);
 	}
+	pose_track_state(s, p->track);
 	for (int i = 0; i < p->scanners; i++)
 		scanner_state(s, &p->scanner[i]);
 	numbers_state(s, p);
@@ -361,7 +404,7 @@ static void forget(struct pipeline *p)
 void pipeline_state(struct pipeline *p, struct state *s, char error[160])
 {
 	snprintf(error, 160, "%s", LOAD_REFUSED);
-	state_tag(s, "pipeline1");
+	state_tag(s, "pipeline2");
 	devices_state(s, p->config, error);
 	if (!s->failed)
 		parts_state(s, p);
@@ -398,6 +441,30 @@ static bool add_scanner(struct pipeline *p, int device)
 	return true;
 }
 
+static struct pose_track *create_track(const struct config *config)
+{
+	struct pose_track_params params = {0};
+
+	for (int i = 0; i < config->devices; i++) {
+		const struct config_device *device = &config->device[i];
+		const enum device_role role = driver_find(device->driver)->role;
+
+		if (role == ROLE_MOTION) {
+			params.motion = true;
+			params.drift = device->drift;
+			params.turn_drift_rad = device->turn_drift_rad_m;
+		} else if (role == ROLE_POSE && !device->fixed) {
+			params.absolute = true;
+			params.jump_m = device->jump_m;
+			params.jump_rad = device->jump_rad;
+			params.on_jump = device->on_jump == JUMP_IGNORE    ? POSE_TRACK_IGNORE
+			                 : device->on_jump == JUMP_NEW_MAP ? POSE_TRACK_NEW_MAP
+			                                                   : POSE_TRACK_KEEP;
+		}
+	}
+	return pose_track_create(&params);
+}
+
 struct pipeline *pipeline_create(const struct config *config, const struct pipeline_sink *sink)
 {
 	struct pipeline *p = calloc(1, sizeof(*p));
@@ -418,7 +485,11 @@ struct pipeline *pipeline_create(const struct config *config, const struct pipel
 			return NULL;
 		}
 	}
-	return p;
+	p->track = create_track(config);
+	if (p->track)
+		return p;
+	pipeline_destroy(p);
+	return NULL;
 }
 
 void pipeline_destroy(struct pipeline *p)
@@ -430,6 +501,7 @@ void pipeline_destroy(struct pipeline *p)
 	for (int i = 0; i < p->config->devices; i++)
 		if (p->device[i].decoder)
 			p->device[i].driver->decoder_destroy(p->device[i].decoder);
+	pose_track_destroy(p->track);
 	free(p->skip);
 	free(p);
 }
@@ -451,6 +523,15 @@ void pipeline_stats(const struct pipeline *p, struct pipeline_stats *ret)
 		for (int k = 0; k < BEAM_STATES; k++)
 			ret->sweep.beams[k] += one.beams[k];
 	}
+}
+
+void pipeline_track(const struct pipeline *p, int device, struct pose_track_status *ret)
+{
+	const enum device_role role = p->device[device].driver->role;
+
+	memset(ret, 0, sizeof(*ret));
+	if ((role == ROLE_POSE && !p->config->device[device].fixed) || role == ROLE_MOTION)
+		pose_track_status(p->track, ret);
 }
 
 int pipeline_devices(const struct pipeline *p)

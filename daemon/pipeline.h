@@ -1,12 +1,14 @@
 /* The pipeline: one reading's way from the wire to the map's rows. It alone joins decoders, assemblers and the row sink.
  *
  *   record -> decoder -> profile | tilt | pose -> assembler -> row, numbered -> row sink (the worker's queue, or a map)
+ *                        pose | motion -> the robot's track -> pose
  *
  * Driven by records, ticks and steps of the wall clock only (law L7): the same list gives the same rows, live or kept. */
 #ifndef FACET_DAEMON_PIPELINE_H
 #define FACET_DAEMON_PIPELINE_H
 
 #include "config/config.h"
+#include "core/pose_track.h"
 #include "core/sweep.h"
 #include "drivers/driver.h"
 
@@ -23,6 +25,9 @@ struct pipeline_sink {
 	/* Replies and signs of life for the devices' dialogues. May be NULL (replay). */
 	void (*reply)(void *ctx, int device, const struct reply *);
 	void (*data)(void *ctx, int device, int64_t t_ns);
+	/* The pose of `device` jumped. Said once the record in which it did is handled whole: with `new_map` its rows were
+	 * the old map's last ones, and what comes belongs to the new one (pipeline_reset). May be NULL. */
+	void (*jump)(void *ctx, int device, const struct pose_jump *);
 };
 
 /* NULL when memory is out. The configuration is borrowed and must outlive the pipeline; its drivers are known ones. */
@@ -49,6 +54,8 @@ struct pipeline_stats {
 	struct sweep_stats sweep; /* summed over the scanners */
 };
 void pipeline_stats(const struct pipeline *, struct pipeline_stats *ret);
+/* Of a device that says where the robot is, or how it moves; all 0 for others. */
+void pipeline_track(const struct pipeline *, int device, struct pose_track_status *ret);
 int pipeline_devices(const struct pipeline *);
 void pipeline_counters(const struct pipeline *, int device, struct decoder_counters *ret);
 void pipeline_timing(const struct pipeline *, int device, struct decoder_timing *ret); /* all 0: nothing is known */

@@ -87,7 +87,7 @@ static void state(struct decoder *d, struct state *s)
 {
 	struct decoder aside = *d;
 
-	state_tag(s, "pose1");
+	state_tag(s, "pose2");
 	state_time(s, &aside.ahead_ns);
 	for (int i = 0; i < POSE_LINE_VERDICTS; i++)
 		state_u64(s, &aside.count[i]);

@@ -223,7 +223,7 @@ static void on_data(void *ctx, int device, int64_t t_ns)
 
 static void open_outcome(struct outcome *o)
 {
-	struct pipeline_sink sink = {o, on_row, on_not_applied, on_flush, on_reply, on_data};
+	struct pipeline_sink sink = {o, on_row, on_not_applied, on_flush, on_reply, on_data, NULL};
 
 	memset(o, 0, sizeof(*o));
 	o->pipeline = pipeline_create(&config, &sink);
@@ -768,7 +768,7 @@ static void a_damaged_list_is_refused_with_a_sentence(void **state)
 	patch_file(path, 0, "FACETJ1\n", 8, &fed, "older facetd");
 	patch_file(path, 0, "#!/bin/s", 8, &fed, "no journal");
 	patch_file(path, 8, "\2", 1, &fed, "damaged");
-	patch_file(path, 8 + 5, "pipeline2", 9, &fed, "another version");
+	patch_file(path, 8 + 5, "pipeline9", 9, &fed, "another version");
 	patch_file(path, record, "\x7f", 1, &fed, "unknown entry");
 	patch_file(path, record, "\0", 1, &fed, "unknown entry");
 	patch_file(path, record + 1 + 16, "\x63", 1, &fed, "not there"); /* the device */

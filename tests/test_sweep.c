@@ -12,6 +12,7 @@
 #include <string.h>
 #include <time.h>
 
+#include "core/mixed.h"
 #include "core/model.h"
 #include "core/sweep.h"
 #include "core/trig.h"
@@ -717,7 +718,7 @@ static void walls_of_a_corridor_are_not_mixed(void **state)
 			seed = seed * 6364136223846793005u + 1442695040888963407u;
 			range[k] = (float)(r + 0.01 * ((double)(seed >> 40) * 0x1p-24 - 0.5));
 		}
-		sweep_mark_mixed(range, states, n, -TRIG_PI / 2, steps[c] * TRIG_DEG);
+		mixed_mark(range, states, n, steps[c] * TRIG_DEG);
 		for (uint32_t k = 1; k + 1 < n; k++) {
 			jumps += fabsf(range[k] - range[k - 1]) > 0.2f && fabsf(range[k] - range[k + 1]) > 0.2f;
 			/* But for the few where wall and end meet. */
@@ -734,7 +735,7 @@ static void mark(const float *range, const uint8_t *given, uint32_t n, char *ret
 	uint8_t states[32] = {0};
 	if (given)
 		memcpy(states, given, n);
-	sweep_mark_mixed(range, states, n, 0, 0.5 * TRIG_DEG);
+	mixed_mark(range, states, n, 0.5 * TRIG_DEG);
 	for (uint32_t i = 0; i < n; i++)
 		ret[i] = states[i] == BEAM_MIXED ? 'm' : states[i] == BEAM_OK ? '.' : 'x';
 	ret[n] = 0;

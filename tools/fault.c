@@ -16,9 +16,14 @@
 static const struct {
 	const char *kind;
 	int64_t for_ns;
-} durations[] = {{"unplug", 1000000000}, {"garbage", 1000000000}, {"silence", 1000000000}, {"stall", 1000000000},
-                 {"refuse", 1000000000}, {"timeout", 1000000000}, {"busy", 1000000000},    {"error", 1000000000},
-                 {"split", INT64_MAX},   {"jitter", INT64_MAX},   {"wander", INT64_MAX},   {"drift", INT64_MAX}};
+} durations[] = {{"unplug", 1000000000},  {"garbage", 1000000000}, {"silence", 1000000000},   {"stall", 1000000000},
+                 {"refuse", 1000000000},  {"timeout", 1000000000}, {"busy", 1000000000},      {"error", 1000000000},
+                 {"split", INT64_MAX},    {"jitter", INT64_MAX},   {"wander", INT64_MAX},     {"drift", INT64_MAX},
+                 {"bus-off", 1000000000}, {"warning", 1000000000}, {"passive", 1000000000},   {"errors", 1000000000},
+                 {"full", 1000000000},    {"down", 1000000000},    {"deleted", 1000000000},   {"frozen", 1000000000},
+                 {"off", 1000000000},     {"silent", 1000000000},  {"heartbeat", 1000000000}, {"no pdo", 1000000000},
+                 {"stuck", 1000000000},   {"rtr", INT64_MAX},      {"extended", INT64_MAX},   {"fd", INT64_MAX},
+                 {"slip", INT64_MAX},     {"blocked", INT64_MAX},  {"slow", INT64_MAX}};
 
 /* What a value may be; kinds that are not here take any, or none. A value of 0 is one that was not given. */
 static const struct {
@@ -33,7 +38,11 @@ static const struct {
               {"mode", 0, 15},         {"permanent baud", 9600, 500000},
               {"encoders", 1, 3},      {"echoes", 1, 5},
               {"scale", 0.001, 1000},  {"clock step", -4294, 4294},
-              {"clock wrap", 0, 4294}, {"counter wrap", 0, 65535}};
+              {"clock wrap", 0, 4294}, {"counter wrap", 0, 65535},
+              {"drop", 0, 1},          {"errors", 1, 100000},
+              {"slip", -1, 10},        {"slow", 0, 1},
+              {"jump", -1000, 1000},   {"power cycle", 0, 1000},
+              {"emcy", 0, 65535},      {"fault", 0, 65535}};
 
 static int refuse(char error[FAULT_ERROR_MAX], const char *text, const char *why)
 {

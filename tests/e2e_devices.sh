@@ -25,7 +25,7 @@ fi
 
 # Nothing there: a sentence that helps, and no failure.
 "$bed" -- "$build/facet" devices >"$scratch/none" 2>&1 || fail "nothing plugged in is no failure"
-has "$scratch/none" "nothing found: no scanner on USB (19a2:5001), no serial line."
+has "$scratch/none" "nothing found: no scanner on USB (19a2:5001), no serial line, no CAN interface."
 
 # Two scanners, one without a serial number, two adapters, one of which udev gave no name.
 "$bed" --scanner 1-1=16160456 --scanner 1-2.3 --adapter ttyUSB0=A5XK3RJT --adapter ttyUSB1= -- \
@@ -59,6 +59,21 @@ assert serial["kind"] == "serial" and serial["id"] == "0403:6001" and serial["dr
 # The adapter is a pseudo-terminal here, and others on this machine may hold one that looks alike.
 assert serial["usable"] or "in use by" in serial["notes"][0], serial
 assert "usb:16160456" in usb["yaml"], usb' "$scratch/json" || fail "the JSON says something else"
+
+# CAN interfaces: as they are, and what would bring them up; the loopback interface is none.
+"$bed" --can can0=0x400c1,up,16 --can vcan0=0xc1,unknown,72 -- "$build/facet" devices >"$scratch/can" 2>&1 || fail "status $? with CAN"
+has "$scratch/can" "CAN interfaces (what is on the bus they do not say"
+has "$scratch/can" "  can0, driver kvaser_pci, up"
+has "$scratch/can" "- {name: servo, driver: canopen, connect: can0, node: 1}"
+has "$scratch/can" "  vcan0, virtual, up, FD"
+{ echo "devices:"; grep '^ *- {' "$scratch/can"; } >"$scratch/can.yaml"
+"$build/facetd" --check-config --config "$scratch/can.yaml" || fail "what is pasted is no right configuration"
+"$bed" --can can1=0x40080,down,16 -- "$build/facet" devices >"$scratch/down" 2>&1
+has "$scratch/down" "  can1, driver kvaser_pci, down"
+has "$scratch/down" '! `ip link set can1 up type can bitrate 500000 restart-ms 100` brings it up'
+"$bed" --can can1=0x40081,down,16 -- "$build/facet" devices >"$scratch/off" 2>&1
+has "$scratch/off" "  can1, driver kvaser_pci, up, its controller is off"
+has "$scratch/off" '`ip link set can1 type can restart` starts it again'
 
 # A port that somebody has open.
 "$bed" --adapter ttyUSB0=A5XK3RJT -- sh -c 'exec 5<>/dev/ttyUSB0; exec "$0" devices' "$build/facet" >"$scratch/held" 2>&1

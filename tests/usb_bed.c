@@ -1,5 +1,6 @@
 /* A machine with simulated USB: a umockdev test bed with scanners and serial adapters, in which a command runs.
- *   usb_bed [--scanner PORT[=SERIAL]]... [--adapter TTY=SERIAL]... [--locked] [--unplug AT,FOR] [--halt AT] -- COMMAND...
+ *   usb_bed [--scanner PORT[=SERIAL]]... [--adapter TTY=SERIAL]... [--can NAME=FLAGS,STATE,MTU]... [--locked]
+ *           [--unplug AT,FOR] [--halt AT] -- COMMAND...
  * A scanner is a simulated usbfs (usbfs.h) before the simulated TiM561's brain (sim_cola.c), which stands in a room. An
  * adapter is an FTDI one with a latency timer of 16 ms and, where it has a SERIAL, a name in /dev/serial/by-id. --locked:
  * nobody but root may open what is plugged in. --unplug, --halt: the first scanner, seconds after COMMAND began; back it
@@ -198,6 +199,30 @@ static void add_adapter(UMockdevTestbed *bed, char *text)
 		add_by_id(bed, text, serial);
 }
 
+/* NAME=FLAGS,STATE,MTU as in sysfs; one whose name begins with v is virtual. */
+static void add_can(UMockdevTestbed *bed, const char *text)
+{
+	char add[512], name[16], state[16];
+	unsigned flags;
+	int mtu;
+
+	if (sscanf(text, "%15[^=]=%x,%15[^,],%d", name, &flags, state, &mtu) != 4)
+		abort();
+	snprintf(add, sizeof(add),
+	         "P: /devices/%s/net/%s\nE: SUBSYSTEM=net\nA: type=280\\n\nA: flags=0x%x\\n\nA: operstate=%s\\n\nA: "
+	         "mtu=%d\\n\n%s\n",
+	         *name == 'v' ? "virtual" : "pci0000:00/0000:00:03.0", name, flags, state, mtu,
+	         *name == 'v' ? "" : "L: device=../../../0000:00:03.0\n");
+	if (!umockdev_testbed_add_from_string(bed, add, NULL))
+		abort();
+	if (*name != 'v' &&
+	    !umockdev_testbed_add_from_string(bed,
+	                                      "P: /devices/pci0000:00/0000:00:03.0\nE: SUBSYSTEM=pci\n"
+	                                      "E: DRIVER=kvaser_pci\nL: driver=../../../bus/pci/drivers/kvaser_pci\n",
+	                                      NULL))
+		abort();
+}
+
 struct orders {
 	double unplug_s, away_s, halt_s; /* -1: not ordered, or done */
 };
@@ -284,6 +309,8 @@ int main(int argc, char **argv)
 			add_scanner(bed, argv[++at]);
 		else if (strcmp(argv[at], "--adapter") == 0 && at + 1 < argc)
 			add_adapter(bed, argv[++at]);
+		else if (strcmp(argv[at], "--can") == 0 && at + 1 < argc)
+			add_can(bed, argv[++at]);
 		else if (strcmp(argv[at], "--halt") == 0 && at + 1 < argc)
 			orders.halt_s = atof(argv[++at]);
 		else if (strcmp(argv[at], "--unplug") != 0 || at + 1 >= argc ||

@@ -17,6 +17,7 @@
 
 #include "drivers/cola.h"
 #include "drivers/usb_list.h"
+#include "tools/can_list.h"
 #include "tools/commands.h"
 #include "tools/serial_list.h"
 
@@ -24,7 +25,7 @@
 #define YAML_MAX  480
 
 struct found {
-	const char *kind; /* "usb", "serial" */
+	const char *kind; /* "usb", "serial", "can" */
 	char title[320], yaml[YAML_MAX];
 	char note[NOTES_MAX][200]; /* what stands in the way, or will */
 	int notes;
@@ -229,7 +230,54 @@ static void describe_serial(const struct serial_line *list, int n, int i, int nu
 		note(ret, "it has no name of its own: after the next plugging its twin may be %s", line->node);
 }
 
+/* Node id and count are its handbook's; the line is one that can be pasted and then says what is missing. */
+static void describe_can(const struct can_interface *can, int number, struct found *ret)
+{
+	char name[24] = "servo";
+
+	*ret = (struct found){.kind = "can",
+	                      .node = can->name,
+	                      .port = "",
+	                      .serial = "",
+	                      .by_id = "",
+	                      .driver = can->driver,
+	                      .usable = can->state == CAN_LIST_UP};
+	snprintf(ret->title, sizeof(ret->title), "%s, %s%s, %s%s", can->name, can->driver[0] ? "driver " : "virtual",
+	         can->driver,
+	         can->state == CAN_LIST_UP    ? "up"
+	         : can->state == CAN_LIST_OFF ? "up, its controller is off"
+	                                      : "down",
+	         can->fd ? ", FD" : "");
+	if (number > 0)
+		snprintf(name, sizeof(name), "servo%d", number + 1);
+	snprintf(ret->yaml, sizeof(ret->yaml), "- {name: %s, driver: canopen, connect: %s, node: 1}", name, can->name);
+	if (can->state == CAN_LIST_DOWN && can->driver[0])
+		note(
+		    ret,
+		    "`ip link set %s up type can bitrate 500000 restart-ms 100` brings it up, with the rate of the bus",
+		    can->name);
+	else if (can->state == CAN_LIST_DOWN)
+		note(ret, "`ip link set %s up` brings it up", can->name);
+	else if (can->state == CAN_LIST_OFF)
+		note(
+		    ret,
+		    "bus-off: check cable, terminators and bit rate; `ip link set %s type can restart` starts it again",
+		    can->name);
+}
+
 /* Saying */
+
+static const char *heading(const char *kind)
+{
+	if (strcmp(kind, "usb") == 0)
+		return "Scanners on USB:";
+	if (strcmp(kind, "serial") == 0)
+		return "Serial lines (who is at their other end they do not say; a servo is driver: modbus, connect: "
+		       "PATH):";
+	return "CAN interfaces (what is on the bus they do not say; an angle in any frame is driver: can, the wheels "
+	       "are "
+	       "driver: odometry):";
+}
 
 static void print_found(const struct found *found)
 {
@@ -244,11 +292,7 @@ static void print_text(const struct found *found, int n)
 
 	for (int i = 0; i < n; i++) {
 		if (strcmp(kind, found[i].kind) != 0)
-			printf("%s%s\n", i ? "\n" : "",
-			       strcmp(found[i].kind, "usb") == 0
-			           ? "Scanners on USB:"
-			           : "Serial lines (who is at their other end they do not say; a servo is "
-			             "driver: modbus, connect: PATH):");
+			printf("%s%s\n", i ? "\n" : "", heading(found[i].kind));
 		kind = found[i].kind;
 		print_found(&found[i]);
 	}
@@ -257,7 +301,8 @@ static void print_text(const struct found *found, int n)
 		       "not\n"
 		       "looked for: - {name: laser, driver: lms1xx, connect: 192.168.0.1}\n");
 	else
-		printf("nothing found: no scanner on USB (%04x:%04x), no serial line. Is it plugged in and switched "
+		printf("nothing found: no scanner on USB (%04x:%04x), no serial line, no CAN interface. Is it plugged "
+		       "in and switched "
 		       "on? `lsusb` "
 		       "lists\nwhat the machine sees. Scanners on Ethernet are not looked for: - {name: laser, driver: "
 		       "tim, "
@@ -301,18 +346,22 @@ int devices_main(int argc, char **argv)
 	                                 NULL,
 	                                 NULL,
 	                                 NULL};
-	static struct found found[USB_LIST_MAX + SERIAL_LIST_MAX];
+	static struct found found[USB_LIST_MAX + SERIAL_LIST_MAX + CAN_LIST_MAX];
+	static struct can_interface can[CAN_LIST_MAX];
 	static struct usb_device usb[USB_LIST_MAX];
 	static struct serial_line serial[SERIAL_LIST_MAX];
 	bool json = false;
 	int n = 0;
 
 	argp_parse(&argp, argc, argv, 0, NULL, &json);
-	int usbs = usb_list(COLA_USB_VENDOR, COLA_USB_PRODUCT, usb), serials = serial_list(serial);
+	int usbs = usb_list(COLA_USB_VENDOR, COLA_USB_PRODUCT, usb), serials = serial_list(serial),
+	    cans = can_list(can);
 	for (int i = 0; i < usbs; i++, n++)
 		describe_usb(usb, usbs, i, n, &found[n]);
 	for (int i = 0; i < serials; i++, n++)
 		describe_serial(serial, serials, i, n, &found[n]);
+	for (int i = 0; i < cans; i++, n++)
+		describe_can(&can[i], i, &found[n]);
 	if (json)
 		return print_json(found, n) ? 1 : fflush(stdout) != 0;
 	print_text(found, n);

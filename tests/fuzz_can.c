@@ -91,6 +91,11 @@ static void must_write_the_same(const struct config_signal *s, const uint8_t *da
 	must((size_t)n == can_wire_put(&f, back));
 	must(memcmp(back, data, 6) == 0 && memcmp(back + 8, data + 8, f.len) == 0);
 	must(memcmp(back + n - 8, data + n - 8, 8) == 0);
+	if (f.len <= 8 && f.flags == 0) {
+		const struct can_frame_at same = can_wire_frame(f.id, f.data, f.len);
+
+		must(same.id == f.id && same.len == f.len && memcmp(same.data, f.data, sizeof f.data) == 0);
+	}
 	if (s->counter.set || s->valid.set || s->mux.set || can_signal_get(s, &f, &v) != CAN_SIGNAL_GOOD)
 		return; /* fields may lie over each other */
 	can_signal_put_bits(s, v.bits, &made);

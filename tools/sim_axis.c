@@ -334,6 +334,11 @@ void sim_axis_slow(struct sim_axis *axis, double share, int64_t t_ns)
 	follow(axis, t_ns);
 }
 
+bool sim_axis_follows(const struct sim_axis *axis)
+{
+	return !axis->stuck && axis->slow >= 1.0;
+}
+
 double sim_axis_angle(const struct sim_axis *axis, int64_t t_ns)
 {
 	return path_at(&axis->motion, t_ns).p;

@@ -72,6 +72,8 @@ void sim_axis_triangle(struct sim_axis *, double from_rad, double to_rad, double
 void sim_axis_stuck(struct sim_axis *, bool on, int64_t t_ns);
 void sim_axis_slow(struct sim_axis *, double share, int64_t t_ns); /* 0 < share <= 1; 1: all is well */
 
+bool sim_axis_follows(const struct sim_axis *); /* neither stuck nor slow */
+
 double sim_axis_angle(const struct sim_axis *, int64_t t_ns); /* true */
 double sim_axis_speed(const struct sim_axis *, int64_t t_ns);
 double sim_axis_demand(const struct sim_axis *, int64_t t_ns); /* where it should be */

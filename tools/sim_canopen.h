@@ -27,10 +27,11 @@ struct sim_canopen_params {
 	int sign;              /* of counts against the axis; 0: 1 */
 	bool unhomed;          /* drive: it counts from 0 where it was switched on, and is not homed */
 	double switch_rad
-	    [2];      /* drive: limit switches for homing methods 17 and 18, in the axis' sense; equal: +-90 degrees */
-	bool keeps;   /* what was written outlives its power */
-	bool factory; /* encoder, inclinometer: mapped as the profiles say; else, and drives always: something else */
-	uint64_t seed;
+	    [2];       /* drive: limit switches for homing methods 17 and 18, in the axis' sense; equal: +-90 degrees */
+	bool keeps;    /* what was written outlives its power */
+	bool factory;  /* encoder, inclinometer: mapped as the profiles say; else, and drives always: something else */
+	bool lateral;  /* inclinometer: the axis tilts 6020, not 6010 */
+	uint64_t seed; /* of how long its answers take */
 };
 
 /* Faults to order (struct sim_fault). Those with `for` hold so long; without it they befall once.

@@ -191,7 +191,7 @@ int64_t sim_drive_deadline(const struct sim_drive *d)
 
 	if (d->watched && !d->unwatched && d->watchdog_ns < deadline)
 		deadline = d->watchdog_ns;
-	if (d->params.strict && d->going && (d->axis->stuck || d->axis->slow < 1.0) && d->look_ns < deadline)
+	if (d->params.strict && d->going && !sim_axis_follows(d->axis) && d->look_ns < deadline)
 		deadline = d->look_ns;
 	return deadline;
 }

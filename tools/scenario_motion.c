@@ -18,10 +18,6 @@
 #include "tools/sim_canopen.h"
 #include "tools/sim_drive.h"
 
-#pragma weak sim_canopen_create
-#pragma weak sim_canopen_status_word
-#pragma weak sim_canopen_nmt_state
-
 #define ANGLE_NS  INT64_C(5000000)
 #define WHEELS_NS INT64_C(20000000)
 #define SPEED_NS  20000000 /* over which a speed is told */
@@ -79,8 +75,6 @@ static int create_canopen(struct scenario_motion *m, int64_t t_ns)
 	const struct sim_canopen_params params = {
 	    .kind = kind[m->params->servo], .node = SCENARIO_NODE, .axis = &m->axis, .seed = m->params->seed};
 
-	if (!sim_canopen_create)
-		return -ENOSYS;
 	return sim_canopen_create(&params, t_ns, &m->servo_brain);
 }
 

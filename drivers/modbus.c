@@ -18,9 +18,9 @@
 #define RTT_MAX_NS  INT64_C(60000000000)
 #define TIME_MAX_NS (INT64_MAX / 4)
 
-enum { ANGLES, WRITES, REFUSED, NO_ANSWER, SLOW, FOREIGN, MALFORMED, COUNTERS };
-static const char *const counter_name[COUNTERS] = {"angles", "writes",  "refused",  "no answer",
-                                                   "slow",   "foreign", "malformed"};
+enum { ANGLES, READS, WRITES, REFUSED, NO_ANSWER, SLOW, FOREIGN, MALFORMED, COUNTERS };
+static const char *const counter_name[COUNTERS] = {"angles",    "reads", "writes",  "refused",
+                                                   "no answer", "slow",  "foreign", "malformed"};
 
 struct decoder {
 	struct config_device device;
@@ -84,18 +84,42 @@ static void say(struct decoder *d, const struct record_sink *sink, int64_t t_ns,
 		sink->reply(sink->ctx, d->index, &reply);
 }
 
+static bool is_position(const struct decoder *d, const struct modbus_transaction *t)
+{
+	const struct config_register *position = &d->device.position;
+
+	return t->function == modbus_wire_read_function(position) &&
+	       t->address == modbus_wire_address(&d->device, position->address) &&
+	       t->n == modbus_wire_registers(position);
+}
+
+static bool is_awaited(const struct decoder *d, const struct config_writes *list, const struct modbus_transaction *t)
+{
+	for (int i = 0; i < list->n; i++)
+		if (list->item[i].until.set && t->function == 3 &&
+		    t->address == modbus_wire_address(&d->device, list->item[i].until.address))
+			return true;
+	return false;
+}
+
+/* One register that its dialogue asks for: the status, or what a step of a sequence waits for. */
+static bool is_asked(const struct decoder *d, const struct modbus_transaction *t)
+{
+	const struct config_device *c = &d->device;
+
+	if (t->n != 1)
+		return false;
+	return (c->status.set && t->function == c->status.function &&
+	        t->address == modbus_wire_address(c, c->status.address)) ||
+	       is_awaited(d, &c->write, t) || is_awaited(d, &c->reset, t) || is_awaited(d, &c->stop, t);
+}
+
 static void decode_angle(struct decoder *d, const struct modbus_transaction *t, const struct record_sink *sink)
 {
 	const struct config_register *position = &d->device.position;
 	int64_t rtt_ns = t->t_answer_ns - t->t_request_ns;
 	struct tilt tilt = {.t_ns = t->t_request_ns + rtt_ns / 2};
 
-	if (t->function != modbus_wire_read_function(position) ||
-	    t->address != modbus_wire_address(&d->device, position->address) ||
-	    t->n != modbus_wire_registers(position)) {
-		d->count[FOREIGN]++;
-		return;
-	}
 	if (modbus_wire_decode(position, t->value, &tilt.angle_rad) < 0) {
 		d->count[MALFORMED]++;
 		return;
@@ -113,6 +137,22 @@ static void decode_angle(struct decoder *d, const struct modbus_transaction *t, 
 	d->count[ANGLES]++;
 	sink->tilt(sink->ctx, d->index, &tilt);
 	say(d, sink, t->t_answer_ns, MODBUS_ANGLE, &tilt.angle_rad, sizeof tilt.angle_rad);
+}
+
+/* A register may be the angle and be waited for: then it is both. */
+static void decode_read(struct decoder *d, const struct modbus_transaction *t, const struct record_sink *sink)
+{
+	uint16_t what[3] = {t->function, t->address, t->value[0]};
+	bool angle = is_position(d, t), asked = is_asked(d, t);
+
+	if (angle)
+		decode_angle(d, t, sink);
+	else if (asked)
+		d->count[READS]++;
+	else
+		d->count[FOREIGN]++;
+	if (asked)
+		say(d, sink, t->t_answer_ns, MODBUS_READ, what, sizeof what);
 }
 
 static void decode_refusal(struct decoder *d, const struct modbus_transaction *t, const struct record_sink *sink)
@@ -140,7 +180,7 @@ static void decode_transaction(struct decoder *d, const struct modbus_transactio
 	} else if (t->function & MODBUS_WIRE_REFUSED) {
 		decode_refusal(d, t, sink);
 	} else if (t->function == 3 || t->function == 4) {
-		decode_angle(d, t, sink);
+		decode_read(d, t, sink);
 	} else {
 		d->count[WRITES]++;
 		say(d, sink, t->t_answer_ns, MODBUS_WRITTEN, &t->address, sizeof t->address);
@@ -192,7 +232,7 @@ static void fields_state(struct decoder *d, struct state *s)
 {
 	const int oldest = d->rtt_n < RTT_KEPT ? 0 : d->rtt_next;
 
-	state_tag(s, "modbus1");
+	state_tag(s, "modbus2");
 	state_int(s, &d->rtt_n, 0, RTT_KEPT);
 	for (int i = 0; i < d->rtt_n && !s->failed; i++) {
 		state_time(s, &d->rtt_ns[(oldest + i) % RTT_KEPT]);

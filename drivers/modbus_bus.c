@@ -290,7 +290,7 @@ static int transact(struct bus *bus, struct modbus_transaction *t)
 	return r;
 }
 
-/* One wish of the loop: 0; -ECONNRESET: the loop closed its end; -errno: the bus is lost. */
+/* One wish of the loop, to write or to read: 0; -ECONNRESET: the loop closed its end; -errno: the bus is lost. */
 static int serve_wish(struct bus *bus)
 {
 	uint8_t bytes[MODBUS_WIRE_MAX];
@@ -301,7 +301,7 @@ static int serve_wish(struct bus *bus)
 		return errno == EAGAIN || errno == EINTR ? 0 : -errno;
 	if (n == 0)
 		return -ECONNRESET;
-	if (modbus_wire_get(bytes, (size_t)n, &t) <= 0 || (t.function != 6 && t.function != 16) ||
+	if (modbus_wire_get(bytes, (size_t)n, &t) <= 0 || t.function & MODBUS_WIRE_REFUSED ||
 	    t.n > MODBUS_MAX_WRITE_REGISTERS)
 		return 0;
 	return transact(bus, &t);

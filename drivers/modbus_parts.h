@@ -1,5 +1,6 @@
-/* What the three files of the Modbus driver share: modbus.c (decoder and table), modbus_bus.c (the thread that waits for
- * libmodbus), modbus_dialogue.c (set-up and sweeping). Nobody else includes it, tests apart. */
+/* What the files of the Modbus driver share: modbus.c (decoder and table), modbus_bus.c (the thread that waits for
+ * libmodbus), modbus_dialogue.c (set-up, faults, watchdog, sweeping), modbus_sequence.c (lists of writes). Nobody else
+ * includes it, tests apart. */
 #ifndef FACET_DRIVERS_MODBUS_PARTS_H
 #define FACET_DRIVERS_MODBUS_PARTS_H
 
@@ -14,6 +15,7 @@
 enum modbus_reply {
 	MODBUS_ANGLE,   /* payload: one double, rad, as decoded */
 	MODBUS_WRITTEN, /* payload: u16 address as on the wire */
+	MODBUS_READ,    /* payload: u16 function, u16 address, u16 value: one register that is not the angle */
 	MODBUS_REFUSED  /* payload: u16 function, u16 address, u16 exception code (0: no valid answer came) */
 };
 
@@ -24,6 +26,25 @@ ssize_t modbus_bus_read(struct link *, uint8_t *buf, size_t cap, int64_t *t_ns);
 ssize_t modbus_bus_write(struct link *, const uint8_t *bytes, size_t len);
 void modbus_bus_error(const struct link *, int error, char ret[160]);
 void modbus_bus_close(struct link *);
+
+/* A list of writes under way (modbus_sequence.c). */
+struct modbus_sequence {
+	const struct config_writes *list; /* borrowed */
+	enum modbus_sequence_state {
+		MODBUS_SEQUENCE_WRITE, /* list->item[at] is to be written: then modbus_sequence_written */
+		MODBUS_SEQUENCE_READ,  /* its `until` is to be read: then modbus_sequence_read */
+		MODBUS_SEQUENCE_WAIT,  /* nothing before due_ns */
+		MODBUS_SEQUENCE_DONE,
+		MODBUS_SEQUENCE_FAILED /* `until` was not so in time; the register was `seen` last */
+	} state;
+	int at;
+	uint16_t seen;
+	int64_t due_ns, by_ns;
+};
+void modbus_sequence_begin(struct modbus_sequence *, const struct config_writes *);
+enum modbus_sequence_state modbus_sequence_look(struct modbus_sequence *, int64_t t_ns);
+void modbus_sequence_written(struct modbus_sequence *, int64_t t_ns);
+void modbus_sequence_read(struct modbus_sequence *, uint16_t value, int64_t t_ns);
 
 /* The dialogue of modbus_dialogue.c. */
 struct dialogue *modbus_dialogue_create(const struct config *, int device);

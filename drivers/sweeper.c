@@ -11,8 +11,10 @@
  * Following error. How fast a servo speeds up and how long it thinks first is not known, so its angle must lie between
  * those of two models, by the tolerance `following`: a fast one, which has the full speed at once, and a slow one, which
  * thinks for DEAD_S and needs RAMP_S for its speed (or has the configured acceleration). A servo whose speed cannot be
- * told has no models: it must not leave the way between start and target by more than the tolerance, and not stand. A
- * program that was itself stopped has seen nothing: the slow model then waits, the fast one does not.
+ * told has no models: it must not leave the way between start and target by more than the tolerance, and not stand.
+ *
+ * A program that was itself stopped for a while, or heard nothing, has seen nothing, and a servo's watchdog may have
+ * stopped it meanwhile: then it is told its target again.
  *
  * A cyclic drive gets the way itself: legs that end at a stand, with the configured acceleration (leg.h), and must be
  * within the tolerance of it. Its time makes steps of at most STEP_MAX_NS: after a pause of the program the set-point
@@ -41,13 +43,15 @@
 #define DEAD_S        0.2
 #define RAMP_S        0.5
 #define STEP_MAX_NS   50000000
-#define LEGS_MAX      16 /* begun in one step: shorter ones than a millisecond or three are held up */
+#define PAUSE_NS      250000000 /* watchdogs are slower */
+#define LEGS_MAX      16        /* begun in one step: shorter ones than a millisecond or three are held up */
 #define HOLD_S        1e9
 #define SAME_RAD      1e-9
 
 void sweeper_init(struct sweeper *s, const struct config *config, int device, bool cyclic, bool has_speed)
 {
 	const struct config_device *servo = &config->device[device];
+	const int64_t period_ns = servo->period_ns > servo->sync_ns ? servo->period_ns : servo->sync_ns;
 
 	memset(s, 0, sizeof *s);
 	s->sweeps = config->sweep.set && !strcmp(config->sweep.device, servo->name);
@@ -63,6 +67,7 @@ void sweeper_init(struct sweeper *s, const struct config *config, int device, bo
 	s->settle_ns = config->sweep.settle_ns;
 	s->acceleration_rad_s2 = servo->acceleration_rad_s2;
 	s->following_rad = servo->following_rad;
+	s->pause_ns = 3 * period_ns > PAUSE_NS ? 3 * period_ns : PAUSE_NS;
 	s->config_limited = servo->has_limits;
 	memcpy(s->config_limit_rad, servo->limits_rad, sizeof s->config_limit_rad);
 	s->target_rad = s->from_rad;
@@ -191,7 +196,7 @@ void sweeper_begin(struct sweeper *s, int64_t t_ns)
 	s->limited = s->config_limited;
 	memcpy(s->limit_rad, s->config_limit_rad, sizeof s->limit_rad);
 	s->angle_known = s->planned = s->towards_to = false;
-	s->clock_ns = s->model_ns = s->taken_ns = t_ns;
+	s->clock_ns = s->model_ns = s->taken_ns = s->looked_ns = t_ns;
 	s->speed_rad_s = s->peak_rad_s;
 	s->model_rad_s = 0.0;
 	s->speed_due = s->sweeps && s->has_speed && s->peak_rad_s > 0.0;
@@ -260,10 +265,21 @@ static void judge_setpoint(struct sweeper *s)
 		halt_off(s, off, "off where it should be", "is it blocked? Or lower `sweep.speed`");
 }
 
+/* Nobody looked for a while. */
+static void tell_again(struct sweeper *s)
+{
+	if (s->phase != SWEEPER_SWEEPING || !s->told)
+		return;
+	s->told = false;
+	s->target_due = true;
+}
+
 void sweeper_angle(struct sweeper *s, double angle_rad, int64_t t_ns)
 {
 	if (!isfinite(angle_rad))
 		return;
+	if (s->angle_known && t_ns - s->angle_ns > s->pause_ns)
+		tell_again(s);
 	if (!s->angle_known || fabs(angle_rad - s->still_rad) > STILL_RAD) {
 		s->still_rad = angle_rad;
 		s->still_ns = t_ns;
@@ -401,6 +417,9 @@ void sweeper_look(struct sweeper *s, int64_t t_ns, struct sweeper_wish *ret)
 {
 	bool moves = s->phase == SWEEPER_SWEEPING || s->phase == SWEEPER_STOPPING;
 
+	if (t_ns - s->looked_ns > s->pause_ns)
+		tell_again(s);
+	s->looked_ns = t_ns;
 	if (moves && s->angle_known && !s->cyclic)
 		decide(s, t_ns);
 	if (s->phase == SWEEPER_STOPPING && t_ns >= s->stop_by_ns)

@@ -42,6 +42,7 @@ struct sweeper {
 	int64_t settle_ns;
 	double acceleration_rad_s2; /* 0: not known */
 	double following_rad;
+	int64_t pause_ns; /* without a look or an angle for so long, the servo may have stopped by its own supervision */
 	bool config_limited;
 	double config_limit_rad[2]; /* of the configuration ... */
 	bool limited;
@@ -58,6 +59,7 @@ struct sweeper {
 	bool angle_known;
 	double angle_rad, still_rad;
 	int64_t angle_ns, still_ns; /* it has stood near still_rad since still_ns */
+	int64_t looked_ns;
 
 	/* The target it has taken, and between where a slow servo would be by now and a fast one. */
 	bool told;

@@ -480,10 +480,13 @@ static void a_pause_of_the_program_is_no_following_error(void **state)
 	sweeper_begin(&sweeper, t_ns);
 	for (int i = 0; i < 50; i++) {
 		assert_int_equal(run(&sweeper, &servo, &t_ns, 0.7 + 0.03 * i, &wish), SWEEPER_RUNS);
-		t_ns += 3000 * MS;
-		if (i % 2) /* the servo went on, or its watchdog stopped it */
+		t_ns += i % 3 == 2 ? 300 * MS : 3000 * MS;
+		if (i % 2) /* the servo went on ... */
 			servo_move(&servo, 3.0);
+		else /* ... or its watchdog stopped it */
+			servo.target = servo.beyond = servo.angle;
 	}
+	assert_true(servo.turns > 30);
 }
 
 /* ---- cyclic ---- */

@@ -4,6 +4,7 @@
  * become a profile or a count. */
 #include "tests/matrix.h"
 
+#include <math.h>
 #include <setjmp.h>
 #include <stdarg.h>
 #include <stddef.h>
@@ -16,6 +17,8 @@
 #define BEFORE_NS (3 * RIG_SECOND)
 #define TEXT_MAX  600
 #define TOLERATED 9
+#define WATCH_NS  (2 * RIG_MS)   /* how often the drive is looked at */
+#define STANDS_NS (150 * RIG_MS) /* no turn of a sweep takes so long */
 
 static const struct matrix_bench *the_bench;
 static struct rig *the_rig; /* also of a row that failed */
@@ -29,7 +32,45 @@ struct play {
 	uint64_t losses;
 	int device;
 	struct decoder_counters before, after;
+	/* The drive: since when it has stood, or moved; when it came to stand first, and moved for good last; -1: never. */
+	int64_t still_ns, stood_ns, moved_ns;
 };
+
+/* The time goes on, and the drive is looked at meanwhile. */
+static void run(struct play *p, int64_t for_ns)
+{
+	const int64_t until_ns = rig_now(p->rig) + for_ns;
+
+	if (!p->bench->speed) {
+		rig_run(p->rig, for_ns);
+		return;
+	}
+	while (rig_now(p->rig) < until_ns) {
+		const int64_t now_ns = rig_now(p->rig);
+		const bool moves = fabs(p->bench->speed(p->rig)) > 1e-3;
+
+		if (moves && p->still_ns >= 0 && now_ns - p->still_ns >= STANDS_NS)
+			p->moved_ns = now_ns;
+		p->still_ns = moves ? -1 : p->still_ns < 0 ? now_ns : p->still_ns;
+		if (p->stood_ns < 0 && p->still_ns >= 0 && now_ns - p->still_ns >= STANDS_NS)
+			p->stood_ns = p->still_ns;
+		rig_run(p->rig, until_ns - now_ns < WATCH_NS ? until_ns - now_ns : WATCH_NS);
+	}
+}
+
+static int64_t wait_data(struct play *p, int64_t limit_ns)
+{
+	const int64_t begin_ns = rig_now(p->rig);
+	struct rig_view view;
+
+	while (rig_now(p->rig) - begin_ns < limit_ns) {
+		run(p, RIG_MS);
+		rig_view(p->rig, p->bench->device, &view);
+		if (view.state == SUPERVISOR_STREAMING && view.last_data_ns > begin_ns)
+			return view.last_data_ns - begin_ns;
+	}
+	return -1;
+}
 
 static void see_counters(const struct play *p, struct decoder_counters *ret)
 {
@@ -67,7 +108,7 @@ static void outlast_faults(struct play *p)
 				next_ns = p->row->fault[i].for_ns;
 		if (next_ns == INT64_MAX)
 			break;
-		rig_run(p->rig, next_ns - now_ns);
+		run(p, next_ns - now_ns);
 		for (int i = 0; i < MATRIX_FAULTS && p->row->fault[i].kind; i++)
 			if (p->row->fault[i].for_ns == next_ns)
 				rig_fault(p->rig, p->bench->device, p->row->fault[i].kind, p->row->fault[i].value,
@@ -85,6 +126,8 @@ static void begin(struct play *p)
 	p->device = rig_find(p->rig, device);
 	if (!p->row->from_start) {
 		rig_start(p->rig);
+		if (p->bench->points && rig_wait_data(p->rig, p->bench->points, 30 * RIG_SECOND) < 0)
+			fail_msg("%s: %s does not stream at first", p->row->name, p->bench->points);
 		if (rig_wait_data(p->rig, device, p->bench->setup_ns) < 0)
 			fail_msg("%s: it does not stream at first", p->row->name);
 		rig_run(p->rig, BEFORE_NS);
@@ -153,6 +196,40 @@ static void check_log(const struct play *p)
 		fail_msg("%s: the log says \"%s\"", p->row->name, text);
 }
 
+/* Nothing is said twice, but that it streams. */
+static void check_said_once(const struct play *p)
+{
+	for (size_t i = p->logged; i < rig_logged(p->rig); i++)
+		for (size_t k = p->logged; k < i; k++) {
+			const struct rig_log *one = rig_log(p->rig, i), *other = rig_log(p->rig, k);
+
+			if (one && other && one->device == p->device && other->device == p->device &&
+			    strcmp(one->text, "streaming") != 0 && strcmp(one->text, other->text) == 0)
+				fail_msg("%s: said twice: \"%s\"", p->row->name, one->text);
+		}
+}
+
+/* Times are those of the row's begin and end. */
+static void check_drive(const struct play *p)
+{
+	const int64_t stood_ns = p->stood_ns < 0 ? -1 : p->stood_ns - p->begin_ns;
+	const bool stands = p->still_ns >= 0 && rig_now(p->rig) - p->still_ns >= STANDS_NS;
+
+	if (!p->bench->speed)
+		return;
+	if (p->row->drive == DRIVE_GOES_ON && !p->row->from_start && stood_ns >= 0)
+		fail_msg("%s: the drive stood after %lld ms", p->row->name, (long long)(stood_ns / RIG_MS));
+	if ((p->row->drive == DRIVE_RESUMES || p->row->drive == DRIVE_HALTS) && stood_ns < 0)
+		fail_msg("%s: the drive never stood", p->row->name);
+	if (p->row->stands_ns > 0 && (stood_ns < 0 || stood_ns > p->row->stands_ns))
+		fail_msg("%s: the drive stood after %lld ms", p->row->name, (long long)(stood_ns / RIG_MS));
+	if (stands != (p->row->drive == DRIVE_HALTS))
+		fail_msg("%s: the drive %s at the end", p->row->name, stands ? "stands" : "moves");
+	if (p->row->sweeps_ns > 0 && p->moved_ns - p->end_ns > p->row->sweeps_ns)
+		fail_msg("%s: the drive moved %lld ms after its end", p->row->name,
+		         (long long)((p->moved_ns - p->end_ns) / RIG_MS));
+}
+
 /* Whole telegrams are decoded, or left out for a reason that is counted. */
 static void check_account(const struct play *p, const struct rig_view *view)
 {
@@ -172,7 +249,7 @@ static void check_points(const struct play *p)
 	struct rig_points points;
 	double astray;
 
-	rig_points(p->rig, p->bench->device, &points);
+	rig_points(p->rig, p->bench->points ? p->bench->points : p->bench->device, &points);
 	astray = (double)(points.points - points.near) / (double)(points.points ? points.points : 1);
 	if ((points.unknown_rows > 0 && p->row->astray <= 0) || astray > (p->row->astray > 0 ? p->row->astray : 0.001))
 		fail_msg("%s: %llu of %llu rows were never measured, %llu of %llu points lie where their beams ended",
@@ -222,6 +299,8 @@ static void check(const struct play *p)
 	check_first_request(p, &view);
 	check_counters(p);
 	check_log(p);
+	check_said_once(p);
+	check_drive(p);
 	check_account(p, &view);
 	check_points(p);
 	if (p->row->losses >= 0 && losses != (uint64_t)p->row->losses)
@@ -264,9 +343,24 @@ static void print_counted(const struct play *p, char text[TEXT_MAX])
 	}
 }
 
+static void print_drive(const struct play *p, char text[TEXT_MAX])
+{
+	text[0] = 0;
+	if (!p->bench->speed)
+		return;
+	if (p->stood_ns < 0 || p->row->from_start)
+		snprintf(text, TEXT_MAX, "%s | ", p->stood_ns < 0 ? "goes on" : "");
+	else if (p->still_ns >= 0)
+		snprintf(text, TEXT_MAX, "stands after %lld | ", (long long)((p->stood_ns - p->begin_ns) / RIG_MS));
+	else
+		snprintf(text, TEXT_MAX, "stands after %lld, sweeps again after %lld | ",
+		         (long long)((p->stood_ns - p->begin_ns) / RIG_MS),
+		         (long long)((p->moved_ns - p->end_ns) / RIG_MS));
+}
+
 static void print_row(const struct play *p)
 {
-	char faults[TEXT_MAX], counted[TEXT_MAX], log[TEXT_MAX], again[40] = "";
+	char drive[TEXT_MAX], faults[TEXT_MAX], counted[TEXT_MAX], log[TEXT_MAX], again[40] = "";
 	struct rig_view view;
 	bool lasts = p->end_ns > p->begin_ns || p->row->from_start;
 
@@ -274,10 +368,11 @@ static void print_row(const struct play *p)
 	print_faults(p, faults);
 	print_counted(p, counted);
 	print_log(p, log);
+	print_drive(p, drive);
 	if (p->row->pause_ns > 0 && lasts)
 		snprintf(again, sizeof(again), "%lld", (long long)(p->again_ns / RIG_MS));
-	printf("row: %s | %s | %s | %s | %s | %s | ", p->bench->title, p->row->name, faults, p->row->does, counted,
-	       log);
+	printf("row: %s | %s | %s | %s | %s | %s | %s", p->bench->title, p->row->name, faults, p->row->does, counted,
+	       log, drive);
 	if (p->row->from_start)
 		printf("| %s |\n", p->row->pause_ns ? again : "never");
 	else
@@ -286,14 +381,14 @@ static void print_row(const struct play *p)
 
 static void play(const struct matrix_bench *bench, const struct matrix_row *row)
 {
-	struct play p = {.bench = bench, .row = row};
+	struct play p = {.bench = bench, .row = row, .still_ns = -1, .stood_ns = -1, .moved_ns = -1};
 
 	begin(&p);
 	outlast_faults(&p);
-	p.again_ns = rig_wait_data(p.rig, bench->device, again_limit(row) + RIG_SECOND);
+	p.again_ns = wait_data(&p, again_limit(row) + RIG_SECOND);
 	if (p.again_ns >= 0 && row->from_start)
 		p.again_ns += p.end_ns - p.begin_ns;
-	rig_run(p.rig, AFTER_NS);
+	run(&p, AFTER_NS);
 	see_counters(&p, &p.after);
 	if (!row->unlisted)
 		print_row(&p);

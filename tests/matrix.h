@@ -32,6 +32,15 @@ struct matrix_row {
 	int64_t again_ns; /* a profile at most so long after its end; from_start: after the start */
 	bool unlisted;    /* left out of the table: one of many alike */
 	double astray;    /* share of the points that may lie elsewhere; 0: one in a thousand */
+	/* Of a bench with a drive: what its axis does. */
+	enum {
+		DRIVE_GOES_ON, /* it never stands, but at its turns */
+		DRIVE_RESUMES, /* it stands, and sweeps again at the end */
+		DRIVE_HALTS,   /* it stands from then on */
+		DRIVE_ANYHOW   /* whatever it does meanwhile, it sweeps at the end */
+	} drive;
+	int64_t stands_ns;                                      /* at most so long after it began; 0: not judged */
+	int64_t sweeps_ns;                                      /* again at most so long after its end; 0: not judged */
 	void (*check)(struct rig *, const struct matrix_row *); /* more, may be NULL */
 };
 
@@ -40,9 +49,11 @@ struct matrix_bench {
 	struct rig *(*make)(const struct matrix_row *); /* with devices attached, not started */
 	/* Counters of whole telegrams with a profile that were left out on purpose; NULL ends. */
 	const char *const *left_out;
-	const char *const *quiet;     /* counters that move without a fault, not shown; NULL ends */
-	const char *const *tolerated; /* may move a little in any row, shown; NULL ends */
-	int64_t setup_ns;             /* patience with a start without faults */
+	const char *const *quiet;            /* counters that move without a fault, not shown; NULL ends */
+	const char *const *tolerated;        /* may move a little in any row, shown; NULL ends */
+	int64_t setup_ns;                    /* patience with a start without faults */
+	const char *points;                  /* whose points are compared; NULL: the device's own */
+	double (*speed)(const struct rig *); /* of the drive's axis, now; NULL: there is none */
 };
 
 #define MATRIX_ROWS_MAX 100

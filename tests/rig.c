@@ -364,6 +364,17 @@ static int compare_times(const void *a, const void *b)
 	return x < y ? -1 : x > y;
 }
 
+/* So large a share of the beams is off by less. */
+static double angle_share(const struct scanner *s, double share)
+{
+	uint64_t sum = 0;
+
+	for (int i = 0; i <= RIG_ANGLES; i++)
+		if ((double)(sum += s->angle_off[i]) > share * (double)s->angles)
+			return 0.001 * (i + 1);
+	return 0;
+}
+
 void rig_points(const struct rig *r, const char *device, struct rig_points *ret)
 {
 	const struct scanner *s = &r->scanner[rig_find(r, device)];
@@ -371,6 +382,8 @@ void rig_points(const struct rig *r, const char *device, struct rig_points *ret)
 	size_t n = s->times < RIG_TIMES ? (size_t)s->times : RIG_TIMES;
 
 	*ret = s->points;
+	ret->angle_p50_deg = angle_share(s, 0.5);
+	ret->angle_p99_deg = angle_share(s, 0.99);
 	memcpy(sorted, s->time_ns, n * sizeof(*sorted));
 	qsort(sorted, n, sizeof(*sorted), compare_times);
 	if (n == 0)
@@ -385,7 +398,8 @@ void rig_points_clear(struct rig *r, const char *device)
 	struct scanner *s = &r->scanner[rig_find(r, device)];
 
 	memset(&s->points, 0, sizeof(s->points));
-	s->times = 0;
+	memset(s->angle_off, 0, sizeof(s->angle_off));
+	s->times = s->angles = 0;
 }
 
 void rig_pipeline_stats(const struct rig *r, struct pipeline_stats *ret)

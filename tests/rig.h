@@ -39,6 +39,11 @@ enum rig_transport { RIG_SERIAL, RIG_TCP, RIG_USB, RIG_CAN, RIG_MODBUS };
  *   "slow writes"  a write takes a byte, the next one 1 ms later
  *   "no baud"      SERIAL: the line refuses this rate (value)
  *
+ * of a CAN bus: those of tools/sim_can_bus.h, and
+ *   "overrun"      so large a share of the frames finds no room in the driver's socket, which is told
+ *   "as fd"        frames of the device come as FD frames of 64 bytes
+ *   "flood"        somebody fills the bus with frames of the lowest priority
+ *
  * and of the world around, whatever the device:
  *   "wall clock"   it is now so many seconds ahead of log time, for those who send it
  *   "late angles"  samples of the servo come so many ms late
@@ -65,7 +70,7 @@ void rig_scene(struct rig *, const char *device, struct scene *ret);
 int64_t rig_epoch_ns(const struct rig *);          /* brains are made with this time */
 double rig_tilt(const struct rig *, int64_t t_ns); /* the true angle of the servo, at a brain's time */
 /* True place of the robot at a brain's time, for its wheels. */
-struct transform rig_base(struct rig *, int64_t t_ns);
+struct pose rig_pose(struct rig *, int64_t t_ns);
 /* The scanners tilt with a simulated axis from now on, whose angle in the sense of the tilt frame `angle` tells. */
 void rig_follow(struct rig *, double (*angle)(void *ctx, int64_t t_ns), void *ctx);
 /* The device's other end; the brain is the rig's from now on. */
@@ -131,6 +136,8 @@ struct rig_points {
 	uint64_t points, near;       /* within RIG_NEAR_M of where the beam truly ended */
 	double worst_m;
 	int64_t time_p50_ns, time_p99_ns, time_worst_ns; /* of rows: |time said - time true|, over the newest 4096 */
+	double angle_p50_deg, angle_p99_deg,
+	    angle_worst_deg; /* of beams: |tilt as placed - true tilt when it was measured| */
 };
 void rig_points(const struct rig *, const char *device, struct rig_points *ret);
 void rig_points_clear(struct rig *, const char *device);

@@ -34,6 +34,7 @@ enum fault {
 	RTR,
 	EXTENDED,
 	FD,
+	AS_FD,
 	FLOOD,
 	FULL,
 	DOWN,
@@ -41,8 +42,8 @@ enum fault {
 	FAULTS
 };
 static const char *const fault_names[] = {"bus-off", "warning", "passive", "errors",   "no ack", "drop",
-                                          "overrun", "late",    "rtr",     "extended", "fd",     "flood",
-                                          "full",    "down",    "deleted", NULL};
+                                          "overrun", "late",    "rtr",     "extended", "fd",     "as fd",
+                                          "flood",   "full",    "down",    "deleted",  NULL};
 
 struct waiting { /* a frame on its way to the bus */
 	struct can_frame_at frame;
@@ -176,6 +177,40 @@ static void tell_error(struct bus *b, uint32_t classes, uint8_t controller)
 
 /* The bus */
 
+static bool somebody_hears(const struct bus *b, int sender)
+{
+	if (sender != -1 && !b->on[BUS_OFF] && !b->on[DOWN] && !b->on[DELETED])
+		return true;
+	for (int i = 0; i < b->nodes && !b->on[NO_ACK]; i++)
+		if (i != sender && rig_alive(b->node[i]))
+			return true;
+	return false;
+}
+
+static int place_of(const struct bus *b, const struct link *l)
+{
+	int i = 0;
+
+	while (b->node[i] != l)
+		i++;
+	return i;
+}
+
+/* A number that nobody takes is overwritten by the next one: controllers of nodes have a mailbox for each. */
+static void put_newest(struct tap *t, const struct can_frame_at *frame, int sent)
+{
+	for (unsigned i = 0; i < t->queue.n; i++) {
+		struct waiting *w = &t->queue.frame[(t->queue.first + i) % NODE_QUEUE];
+
+		if (w->frame.id != frame->id)
+			continue;
+		t->lost_profiles += (uint64_t)w->sent;
+		*w = (struct waiting){*frame, sent};
+		return;
+	}
+	put(&t->queue, frame, sent);
+}
+
 static void drain(struct link *l)
 {
 	struct tap *t = l->own;
@@ -191,7 +226,9 @@ static void drain(struct link *l)
 		l->brain.counts(l->brain.ctx, &counts);
 		const int sent = (int)(counts.sent - t->sent_seen);
 		t->sent_seen = counts.sent;
-		if (t->queue.n < NODE_QUEUE)
+		if (!somebody_hears(t->bus, place_of(t->bus, l)))
+			put_newest(t, &frame, sent);
+		else if (t->queue.n < NODE_QUEUE)
 			put(&t->queue, &frame, sent);
 		else
 			t->lost_profiles += (uint64_t)sent;
@@ -217,16 +254,6 @@ static int64_t duration_ns(const struct can_frame_at *f)
 static uint32_t priority(const struct can_frame_at *f)
 {
 	return f->id & CAN_WIRE_EXTENDED ? (f->id & 0x1fffffff) << 1 | 1 : (f->id & 0x7ff) << 19;
-}
-
-static bool somebody_hears(const struct bus *b, int sender)
-{
-	if (sender != -1 && !b->on[BUS_OFF] && !b->on[DOWN] && !b->on[DELETED])
-		return true;
-	for (int i = 0; i < b->nodes && !b->on[NO_ACK]; i++)
-		if (i != sender && rig_alive(b->node[i]))
-			return true;
-	return false;
 }
 
 static bool host_sends(const struct bus *b)
@@ -293,6 +320,13 @@ static void to_brains(struct bus *b, const struct can_frame_at *frame, int sende
 	}
 }
 
+static void make_fd(struct can_frame_at *frame)
+{
+	frame->flags |= CAN_WIRE_FD;
+	memset(frame->data + frame->len, 0x55, sizeof(frame->data) - frame->len);
+	frame->len = 64;
+}
+
 /* Frames of the same number that are none of the driver's. */
 static void send_twin(struct bus *b, const struct can_frame_at *frame)
 {
@@ -306,9 +340,7 @@ static void send_twin(struct bus *b, const struct can_frame_at *frame)
 		for (int i = 0; i < twin.len; i++)
 			twin.data[i] ^= 0x55;
 	} else if (b->on[FD]) {
-		twin.flags |= CAN_WIRE_FD;
-		twin.len = 64;
-		memset(twin.data, 0x55, sizeof(twin.data));
+		make_fd(&twin);
 	} else {
 		return;
 	}
@@ -323,6 +355,8 @@ static void end_frame(struct bus *b)
 
 	b->busy = false;
 	frame.t_ns = b->rig->now_ns;
+	if (b->on[AS_FD] && sender >= 0)
+		make_fd(&frame);
 	if (befalls(b, DROP)) {
 		if (sender >= 0)
 			((struct tap *)b->node[sender]->own)->lost_profiles += (uint64_t)b->current.sent;

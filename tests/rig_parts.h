@@ -13,6 +13,7 @@
 #define RIG_DUMMY_FD 1000
 #define RIG_TRUTHS   160 /* profiles remembered: a second and more at 75 Hz and 2 turns */
 #define RIG_TIMES    4096
+#define RIG_ANGLES   2000
 
 struct rig_carrier {
 	void (*attach)(struct link *); /* its brain has come */
@@ -47,7 +48,7 @@ struct link {
 
 /* What a scanner measured: where each beam ended. */
 struct truth {
-	int64_t t_ns, turn_ns;
+	int64_t t_ns, turn_ns, beam_ns;
 	int interlace, n;
 	double first_rad, step_rad;
 	float range_m[PROFILE_BEAMS_MAX]; /* < 0: nothing */
@@ -65,6 +66,7 @@ struct scanner {
 	struct rig_points points;
 	int64_t time_ns[RIG_TIMES];
 	uint64_t times;
+	uint64_t angles, angle_off[RIG_ANGLES + 1]; /* how many are off by so many thousandths of a degree; or more */
 };
 
 /* What was decoded of a device, and when. */

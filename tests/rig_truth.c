@@ -12,6 +12,7 @@
 
 #define REACH_M  30.0
 #define KNOWN_NS (2 * RIG_SECOND)
+#define COMPARED 8 /* every so manieth beam's angle is */
 
 /* Forth and back along the drive, so that it never ends. */
 struct pose rig_place(const struct rig *r, int64_t piece)
@@ -24,21 +25,20 @@ struct pose rig_place(const struct rig *r, int64_t piece)
 	return world_drive(r->world, t_s > length_s ? 2 * length_s - t_s : t_s);
 }
 
-static struct transform base_at(struct rig *r, int64_t t_ns)
+struct pose rig_pose(struct rig *r, int64_t t_ns)
 {
 	int64_t since_ns = t_ns - RIG_EPOCH_NS, piece = since_ns / RIG_POSE_NS;
 	double part = (double)(since_ns - piece * RIG_POSE_NS) / (double)RIG_POSE_NS;
-	struct vec3 p;
-	struct quat q;
+	struct pose pose = {.t_ns = t_ns};
 
 	if (r->piece != piece) {
 		r->pose[0] = rig_place(r, piece);
 		r->pose[1] = rig_place(r, piece + 1);
 		r->piece = piece;
 	}
-	p = vec3_lerp(r->pose[0].position_m, r->pose[1].position_m, part);
-	q = quat_between(r->pose[0].rotation, r->pose[1].rotation, part);
-	return transform_quat(p, q);
+	pose.position_m = vec3_lerp(r->pose[0].position_m, r->pose[1].position_m, part);
+	pose.rotation = quat_between(r->pose[0].rotation, r->pose[1].rotation, part);
+	return pose;
 }
 
 /* Up and down between the ends of the configured sweep; positive looks down. */
@@ -57,7 +57,8 @@ double rig_tilt(const struct rig *r, int64_t t_ns)
 
 static struct transform laser_at(struct scanner *s, int64_t t_ns)
 {
-	struct transform base = base_at(s->rig, t_ns);
+	const struct pose pose = rig_pose(s->rig, t_ns);
+	struct transform base = transform_quat(pose.position_m, pose.rotation);
 	struct transform tilt = transform_tilt(s->tilts ? rig_tilt(s->rig, t_ns) : 0.0), t;
 
 	t = transform_compose(&base, &s->base_tilt);
@@ -105,6 +106,7 @@ void rig_scan(void *ctx, struct profile *p)
 
 	truth->t_ns = p->t_ns;
 	truth->turn_ns = p->turn_ns;
+	truth->beam_ns = p->beam_ns;
 	truth->interlace = p->interlace;
 	truth->n = p->n;
 	truth->first_rad = p->first_rad;
@@ -169,6 +171,27 @@ static const struct truth *recognise(const struct scanner *s, const struct row *
 	return found;
 }
 
+/* The tilt that its place in the map tells, against the true one of its own time. Beams along the axis tell nothing. */
+static void compare_angle(struct scanner *s, const struct truth *truth, int k, const struct row_beam *b)
+{
+	const int64_t t_ns =
+	    truth->t_ns + k % truth->interlace * truth->turn_ns + k / truth->interlace * truth->beam_ns;
+	const struct pose pose = rig_pose(s->rig, t_ns);
+	const struct transform base = transform_quat(pose.position_m, pose.rotation);
+	const struct transform mounted = transform_compose(&base, &s->base_tilt), back = transform_inverse(&mounted);
+	const struct vec3 way = {b->point.x - b->origin.x, b->point.y - b->origin.y, b->point.z - b->origin.z};
+	const struct vec3 d = transform_direction(&back, way);
+	double off;
+
+	if (fabs(trig_cos(truth->first_rad + k * truth->step_rad)) < 0.3)
+		return;
+	off = fabs(trig_atan2(-d.z, d.x) - rig_tilt(s->rig, t_ns)) / TRIG_DEG;
+	s->angles++;
+	s->angle_off[off < 0.001 * RIG_ANGLES ? (int)(1000 * off) : RIG_ANGLES]++;
+	if (off > s->points.angle_worst_deg)
+		s->points.angle_worst_deg = off;
+}
+
 void rig_compare(struct scanner *s, const struct row *row)
 {
 	int64_t off_ns = 0;
@@ -191,6 +214,8 @@ void rig_compare(struct scanner *s, const struct row *row)
 			off_m = sqrt(d.x * d.x + d.y * d.y + d.z * d.z);
 			if (off_m > s->points.worst_m)
 				s->points.worst_m = off_m;
+			if (i % COMPARED == 0 && s->tilts)
+				compare_angle(s, truth, k, b);
 		}
 		s->points.points++;
 		s->points.near += off_m <= RIG_NEAR_M;

@@ -9,7 +9,7 @@
 
 #include <cmocka.h>
 
-#include "tests/rig.h"
+#include "tests/rig_robot.h"
 
 #define LMS2XX                                                                                                       \
 	"mount: {base_tilt: {xyz: [0.2, 0, 0.4]}, tilt_laser: {xyz: [0, 0, 0.05]}}\n"                                \
@@ -120,9 +120,46 @@ static void the_same_run_is_the_same_again(void **state)
 	assert_true(points[0].points > 0);
 }
 
+static void swept_by_the_driver(enum robot_servo servo)
+{
+	struct rig *rig =
+	    robot_create(&(struct robot_params){.servo = servo, .speed_deg = 37.5, .rig = {.seed = 5, .thin = 4}});
+	struct rig_points points;
+	struct rig_view view;
+
+	rig_start(rig);
+	if (rig_wait_data(rig, "laser", 20 * RIG_SECOND) <= 0)
+		fail_msg("%s: the scanner does not stream", robot_servo_name(servo));
+	rig_run(rig, 20 * RIG_SECOND);
+	print_log(rig);
+	rig_view(rig, "servo", &view);
+	rig_points(rig, "laser", &points);
+	printf("note: %s: %llu angles of %llu sent, %llu lost, %llu rows (%llu unknown), %llu points, %llu near, worst "
+	       "%.3f m, angle %.3f / %.3f / %.3f deg\n",
+	       robot_servo_name(servo), (unsigned long long)view.profiles, (unsigned long long)view.sent.sent,
+	       (unsigned long long)view.lost_profiles, (unsigned long long)points.rows,
+	       (unsigned long long)points.unknown_rows, (unsigned long long)points.points,
+	       (unsigned long long)points.near, points.worst_m, points.angle_p50_deg, points.angle_p99_deg,
+	       points.angle_worst_deg);
+	if (view.state != SUPERVISOR_STREAMING)
+		fail_msg("%s does not stream", robot_servo_name(servo));
+	assert_true(points.unknown_rows == 0 && points.points > 0);
+	assert_true(points.near * 1000 >= points.points * 999);
+	rig_destroy(rig);
+}
+
+static void a_servo_on_any_bus_is_swept_and_its_points_lie_where_the_beams_ended(void **state)
+{
+	(void)state;
+	swept_by_the_driver(ROBOT_CAN);
+	swept_by_the_driver(ROBOT_RTU);
+	swept_by_the_driver(ROBOT_TCP);
+}
+
 int main(void)
 {
 	const struct CMUnitTest tests[] = {
+	    cmocka_unit_test(a_servo_on_any_bus_is_swept_and_its_points_lie_where_the_beams_ended),
 	    cmocka_unit_test(a_scanner_streams_and_its_rows_lie_where_its_beams_ended),
 	    cmocka_unit_test(a_line_that_is_pulled_out_is_lost_and_comes_back),
 	    cmocka_unit_test(the_same_run_is_the_same_again),

@@ -1,0 +1,193 @@
+/* Law: whatever the matrix of faults has for a CAN bus, a driver that reads an angle from it does what its row says, counts it,
+ * says it once, and angles flow again within the row's time; no beam is placed by an angle that was none. Rows CAN and Time
+ * of the table in docs/devices.md; those of CANopen are in test_matrix_canopen.c. */
+#include <setjmp.h>
+#include <stdarg.h>
+#include <stddef.h>
+#include <stdint.h>
+#include <stdio.h>
+
+#include <cmocka.h>
+
+#include "tests/matrix.h"
+#include "tests/rig_robot.h"
+
+#define MS     RIG_MS
+#define SECOND RIG_SECOND
+#define EVER   INT64_MAX
+#define MANY   1000000
+
+static struct rig *make(const struct matrix_row *row)
+{
+	return robot_create(
+	    &(struct robot_params){.servo = ROBOT_CAN, .keys = row->keys, .rig = {.seed = 7, .thin = 8}});
+}
+
+static const char *const left_out[] = {"short", "invalid", NULL};
+static const char *const quiet[] = {"angles", NULL};
+static const struct matrix_bench bench = {.title = "CAN",
+                                          .device = "servo",
+                                          .points = "laser",
+                                          .make = make,
+                                          .left_out = left_out,
+                                          .quiet = quiet,
+                                          .setup_ns = SECOND};
+
+#define GAP (20 * MS) /* without an angle, where nothing is the matter */
+
+static const struct matrix_row rows[] = {
+    {.name = "it sends",
+     .does = "reads it; nothing is ever sent",
+     .from_start = true,
+     .pause_ns = GAP,
+     .again_ns = 100 * MS},
+    {.name = "extended frames with the same number (EFF/SFF)",
+     .does = "takes its own kind only",
+     .fault = {{"extended", 0, 5 * SECOND}},
+     .counted = {{"foreign", 900, 1100}},
+     .pause_ns = GAP,
+     .again_ns = GAP},
+    {.name = "remote requests (RTR) for it",
+     .does = "takes none for an angle",
+     .fault = {{"rtr", 0, 5 * SECOND}},
+     .counted = {{"remote", 900, 1100}},
+     .pause_ns = GAP,
+     .again_ns = GAP},
+    {.name = "its frames as CAN FD",
+     .does = "reads them",
+     .fault = {{"as fd", 0, 5 * SECOND}},
+     .pause_ns = GAP,
+     .again_ns = GAP},
+    {.name = "a short frame (dlc)",
+     .does = "refuses it",
+     .fault = {{"short", 0, 0}},
+     .counted = {{"short", 1, 1}, {"lost by counter", 1, 1}},
+     .pause_ns = GAP},
+    {.name = "short frames for 3 s",
+     .does = "refuses them, says why there is no angle",
+     .fault = {{"short", 0, 3 * SECOND}},
+     .counted = {{"short", 500, 610}},
+     .losses = -1,
+     .log = "they are too short",
+     .pause_ns = 3100 * MS,
+     .again_ns = 100 * MS},
+    {.name = "not valid for 3 s",
+     .does = "uses none, says so",
+     .fault = {{"invalid", 0, 3 * SECOND}},
+     .counted = {{"invalid", 500, 610}},
+     .losses = -1,
+     .log = "not `valid`",
+     .pause_ns = 3100 * MS,
+     .again_ns = 100 * MS},
+    {.name = "counter gap",
+     .does = "counts the frames that never came, uses the next",
+     .fault = {{"gap", 5, 0}},
+     .counted = {{"lost by counter", 5, 5}},
+     .pause_ns = GAP},
+    {.name = "every tenth frame lost on the bus",
+     .does = "counts them by the counter; goes on",
+     .fault = {{"drop", 0.1, 5 * SECOND}},
+     .counted = {{"lost by counter", 50, 200}},
+     .pause_ns = 50 * MS,
+     .again_ns = GAP},
+    {.name = "every fifth frame found no room in the socket",
+     .does = "counts what the kernel says",
+     .fault = {{"overrun", 0.2, 5 * SECOND}},
+     .counted = {{"lost by counter", 100, 300}, {"not received", 100, 300}},
+     .pause_ns = 50 * MS,
+     .again_ns = GAP},
+    {.name = "the controller warns (error frame)",
+     .does = "goes on, says so",
+     .fault = {{"warning", 0, 3 * SECOND}},
+     .counted = {{"error frames", 2, 2}},
+     .log = "the controller warns of many errors",
+     .pause_ns = GAP,
+     .again_ns = GAP},
+    {.name = "error passive",
+     .does = "goes on, says so",
+     .fault = {{"passive", 0, 3 * SECOND}},
+     .counted = {{"error frames", 2, 2}},
+     .log = "error passive",
+     .pause_ns = GAP,
+     .again_ns = GAP},
+    {.name = "bus errors without end",
+     .does = "is never told of single ones; frames come later",
+     .fault = {{"errors", 0, 5 * SECOND}},
+     .pause_ns = GAP,
+     .again_ns = GAP},
+    {.name = "bus-off for 3 s, restarted",
+     .does = "says so and how it is started; never does it itself",
+     .fault = {{"bus-off", 0, 3 * SECOND}},
+     .counted = {{"error frames", 2, 2}, {"bus off", 1, 1}, {"lost by counter", 0, 700}},
+     .losses = -1,
+     .log = "bus-off",
+     .pause_ns = 3100 * MS,
+     .again_ns = 100 * MS},
+    {.name = "interface down for 3 s (ENETDOWN)",
+     .does = "tries to open it at least once a second",
+     .fault = {{"down", 0, 3 * SECOND}},
+     .losses = -1,
+     .log = "is down",
+     .pause_ns = 5 * SECOND,
+     .again_ns = 2 * SECOND},
+    {.name = "interface deleted for 3 s (ENODEV)",
+     .does = "opens the new one by its name",
+     .fault = {{"deleted", 0, 3 * SECOND}},
+     .losses = -1,
+     .log = "there is no interface",
+     .pause_ns = 5 * SECOND,
+     .again_ns = 2 * SECOND},
+    {.name = "a bus full of other frames",
+     .does = "sees none of them (filter); its own come a frame later",
+     .fault = {{"flood", 0, 3 * SECOND}},
+     .pause_ns = GAP,
+     .again_ns = GAP},
+    {.name = "silence for 0.3 s",
+     .does = "waits; rows without an angle are dropped and counted",
+     .fault = {{"silence", 0, 300 * MS}},
+     .counted = {{"lost by counter", 59, 61}},
+     .pause_ns = 320 * MS,
+     .again_ns = GAP},
+    {.name = "silence for 5 s",
+     .does = "is lost after `timeout`, listens on",
+     .fault = {{"silence", 0, 5 * SECOND}},
+     .losses = -1,
+     .log = "no frame 0x181 within",
+     .pause_ns = 5500 * MS,
+     .again_ns = 500 * MS},
+    {.name = "another id for 3 s",
+     .does = "the same",
+     .fault = {{"wrong id", 0, 3 * SECOND}},
+     .losses = -1,
+     .log = "no frame 0x181 within",
+     .counted = {{"lost by counter", 0, 700}},
+     .pause_ns = 3100 * MS,
+     .again_ns = 100 * MS},
+    {.name = "step of CLOCK_REALTIME by an hour",
+     .does = "nothing: the kernel's stamps are turned into log time",
+     .fault = {{"wall clock", 3600, 5 * SECOND}},
+     .pause_ns = GAP,
+     .again_ns = GAP},
+    {.name = "angles late by 20 ms",
+     .does = "profiles wait for them",
+     .fault = {{"late angles", 20, 5 * SECOND}},
+     .pause_ns = 50 * MS,
+     .again_ns = 50 * MS},
+    {.name = "angles missing for 5 s",
+     .does = "rows without an angle are dropped and counted",
+     .fault = {{"no angles", 0, 5 * SECOND}},
+     .losses = -1,
+     .log = "no frame 0x181 within",
+     .counted = {{"lost by counter", 0, 1100}},
+     .pause_ns = 5500 * MS,
+     .again_ns = 500 * MS},
+    {.name = "reversed sweep (the servo turns round)",
+     .does = "goes on; points of both ways lie where their beams ended",
+     .pause_ns = GAP,
+     .again_ns = GAP},
+};
+
+int main(void)
+{
+	return matrix_run(&bench, rows, sizeof(rows) / sizeof(rows[0]));
+}

@@ -179,6 +179,49 @@ void control_put_clock_event(struct buffer *b, int64_t step_ns, int64_t ahead_ns
 	                 (double)ahead_ns / 1e9));
 }
 
+const char *control_on_jump(enum pose_track_on_jump done)
+{
+	static const char *const names[] = {
+	    [POSE_TRACK_KEEP] = "keep", [POSE_TRACK_IGNORE] = "ignore", [POSE_TRACK_NEW_MAP] = "new_map"};
+
+	return names[done];
+}
+
+void control_put_jump_event(struct buffer *b, const char *device, const struct pose_jump *jump)
+{
+	put(b, json_pack("{s:s, s:s, s:f, s:f, s:f, s:s, s:b}", "class", "JUMP", "device", device, "t",
+	                 (double)jump->t_ns / 1e9, "distance", jump->distance_m, "angle", jump->angle_rad, "done",
+	                 control_on_jump(jump->done), "back", jump->back));
+}
+
+static void put_id(const uint8_t map_id[16], char ret[33])
+{
+	for (int i = 0; i < 16; i++)
+		snprintf(ret + 2 * i, 3, "%02x", map_id[i]);
+}
+
+void control_put_map_event(struct buffer *b, const uint8_t map_id[16], uint32_t generation, const uint8_t before[16])
+{
+	char id[33], old[33];
+
+	put_id(map_id, id);
+	put_id(before, old);
+	put(b, json_pack("{s:s, s:s, s:I, s:s}", "class", "MAP", "map", id, "generation", (json_int_t)generation,
+	                 "before", old));
+}
+
+static json_t *text_json(const char *text);
+
+void control_put_saved_event(struct buffer *b, const char *map, const char *file, const char *error)
+{
+	json_t *json =
+	    json_pack("{s:s, s:s, s:o}", "class", "SAVED", "map", map, "file", file ? text_json(file) : json_null());
+
+	if (error)
+		json_object_set_new(json, "error", text_json(error));
+	put(b, json);
+}
+
 static json_t *integer(uint64_t value)
 {
 	return json_integer((json_int_t)value);
@@ -227,6 +270,24 @@ static json_t *timing_json(const struct decoder_timing *t)
 	return json;
 }
 
+/* How sure the robot's place is; null where nobody can tell. */
+static json_t *sigma_json(const struct pose_track_status *track)
+{
+	return track->sure ? json_pack("{s:f, s:f}", "position", track->sigma_m, "heading", track->sigma_rad)
+	                   : json_null();
+}
+
+/* Of a device that says where the robot is, or how it moves. */
+static void put_track(json_t *device, const struct pose_track_status *track)
+{
+	if (!track->known)
+		return;
+	json_object_set_new(device, "sigma", sigma_json(track));
+	json_object_set_new(device, "jumps", integer(track->jumps));
+	json_object_set_new(device, "late", integer(track->late));
+	json_object_set_new(device, "gaps", integer(track->gaps));
+}
+
 /* Seconds for which nothing came from a device that streams; null where that means nothing. */
 static json_t *silent_json(const struct supervisor_device *line, bool fixed, int64_t t_ns)
 {
@@ -248,8 +309,7 @@ static json_t *devices_json(const struct control_status *s)
 		for (int k = 0; k < s->device[i].counters.n; k++)
 			json_object_set_new(counters, s->device[i].counters.counter[k].name,
 			                    integer(s->device[i].counters.counter[k].count));
-		json_array_append_new(
-		    list,
+		json_t *device =
 		    json_pack("{s:s, s:s, s:s, s:f, s:o, s:f, s:o, s:I, s:I, s:I, s:I, s:I, s:o, s:o, s:o}", "name",
 		              s->device[i].name, "driver", s->device[i].driver, "state",
 		              supervisor_state_name(line->state), "since", (double)(s->t_ns - line->since_ns) / 1e9,
@@ -257,7 +317,9 @@ static json_t *devices_json(const struct control_status *s)
 		              "timing", timing_json(&s->device[i].timing), "records", (json_int_t)line->decoded,
 		              "bytes_in", (json_int_t)line->bytes_in, "bytes_out", (json_int_t)line->bytes_out, "opens",
 		              (json_int_t)line->opens, "losses", (json_int_t)line->losses, "error",
-		              text_json(line->error), "note", text_json(line->note), "counters", counters));
+		              text_json(line->error), "note", text_json(line->note), "counters", counters);
+		put_track(device, &s->device[i].track);
+		json_array_append_new(list, device);
 	}
 	return list;
 }
@@ -284,8 +346,7 @@ void control_put_status(struct buffer *b, const struct control_status *s)
 	char map_id[33];
 	json_t *json = json_object();
 
-	for (int i = 0; i < 16; i++)
-		snprintf(map_id + 2 * i, 3, "%02x", s->map_id[i]);
+	put_id(s->map_id, map_id);
 	json_object_update_new(json,
 	                       json_pack("{s:s, s:s, s:s, s:I, s:f, s:f, s:f, s:I, s:b}", "class", "STATUS", "version",
 	                                 FACET_VERSION, "map", map_id, "generation", (json_int_t)s->generation, "cell",

@@ -4,6 +4,7 @@
 
 #include "core/model.h"
 #include "core/native.h"
+#include "core/pose_track.h"
 #include "daemon/supervisor.h"
 #include "daemon/worker.h"
 
@@ -59,6 +60,7 @@ struct control_status {
 		double rate; /* profiles, angles or poses a second */
 		bool fixed;  /* nothing is ever to come from it */
 		struct decoder_timing timing;
+		struct pose_track_status track; /* of those that say where the robot is, or how it moves */
 		struct decoder_counters counters;
 	} device[CONFIG_DEVICES_MAX];
 	size_t clients;
@@ -71,6 +73,13 @@ void control_put_version(struct buffer *);
 void control_put_answer(struct buffer *, const struct control_command *);
 void control_put_error(struct buffer *, const char *sentence);
 void control_put_device_event(struct buffer *, const char *device, const char *state, const char *text);
+/* The pose of `device` jumped. */
+void control_put_jump_event(struct buffer *, const char *device, const struct pose_jump *);
+const char *control_on_jump(enum pose_track_on_jump); /* "keep", ... */
+/* A map ended, another began. */
+void control_put_map_event(struct buffer *, const uint8_t map_id[16], uint32_t generation, const uint8_t before[16]);
+/* An ended map was saved as `file`; or (`file` NULL) was not, and why. */
+void control_put_saved_event(struct buffer *, const char *map, const char *file, const char *error);
 /* The wall clock was set by `step_ns` and is now `ahead_ns` ahead of the times of the daemon. */
 void control_put_clock_event(struct buffer *, int64_t step_ns, int64_t ahead_ns);
 

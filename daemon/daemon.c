@@ -2,7 +2,7 @@
  *
  *   device readable ─► supervisor ─► on_record: journal, pipeline ─► worker's queue
  *   10 Hz ───────────► on_tick:      journal, pipeline; was the wall clock set?
- *   worker ready ────► on_results:   publisher, then every client that has room
+ *   worker ready ────► on_results:   publisher, then every client that has room; a map that ended, to the archive
  *   second ──────────► on_second:    rates, the journal's disk
  *   watchdog ────────► on_watchdog:  only while the worker works or is idle
  *
@@ -23,6 +23,7 @@
 #include <unistd.h>
 #include <uv.h>
 
+#include "daemon/archive.h"
 #include "daemon/control.h"
 #include "daemon/journal.h"
 #include "daemon/log.h"
@@ -39,6 +40,7 @@
 #define LATENCIES     1024 /* the newest, for the percentiles */
 #define RATE_SECONDS  4    /* rates are means over so long */
 #define CLIENTS_SHOWN 64
+#define JUMP_LOG_NS   1000000000
 
 /* A device's descriptor in the loop; freed by libuv's last call. */
 struct watcher {
@@ -58,6 +60,7 @@ struct daemon {
 	struct pipeline *pipeline;
 	struct supervisor *supervisor;
 	struct server *server;
+	struct archive *archive;
 	struct journal *journal;
 	struct journal_sink keep; /* empty without a journal */
 	bool journal_failed;
@@ -77,6 +80,8 @@ struct daemon {
 	uint64_t queue_full_seen;
 	bool overloaded, memory_full;
 	uint8_t map_id[16];
+	int64_t jump_told_ns; /* a line was logged of a jump */
+	uint64_t jumps_untold;
 	double latency_ms[LATENCIES];
 	uint64_t latencies;
 	struct grid_stats grid;
@@ -103,6 +108,15 @@ static void fail(struct daemon *d, int r, const char *sentence)
 		snprintf(d->error, 320, "%s", sentence);
 	}
 	stop(d);
+}
+
+/* Events */
+
+static void tell_clients(struct daemon *d, struct buffer *message)
+{
+	if (d->server)
+		server_event(d->server, (const char *)message->data, message->len);
+	buffer_finish(message);
 }
 
 /* Devices */
@@ -186,11 +200,8 @@ static void look_for_step(struct daemon *d)
 	if (d->keep.clock)
 		d->keep.clock(d->keep.ctx, offset_ns - d->clock_offset_ns);
 	pipeline_clock(d->pipeline, offset_ns - d->clock_offset_ns);
-	if (!d->server)
-		return;
 	control_put_clock_event(&message, step_ns, offset_ns - d->clock_offset_ns);
-	server_event(d->server, (const char *)message.data, message.len);
-	buffer_finish(&message);
+	tell_clients(d, &message);
 }
 
 static void on_record(void *ctx, const struct record *record)
@@ -221,11 +232,8 @@ static void log_device(void *ctx, int device, int priority, const char *text)
 			         counted[0] ? ", " : " (", counters.counter[i].name,
 			         (unsigned long long)counters.counter[i].count);
 	log_line(priority, "%s: %s%s%s", d->config->device[device].name, text, counted, counted[0] ? ")" : "");
-	if (!d->server)
-		return;
 	control_put_device_event(&message, d->config->device[device].name, supervisor_state_name(line->state), text);
-	server_event(d->server, (const char *)message.data, message.len);
-	buffer_finish(&message);
+	tell_clients(d, &message);
 }
 
 static void on_devices(uv_timer_t *timer)
@@ -287,6 +295,45 @@ static void on_data(void *ctx, int device, int64_t t_ns)
 	supervisor_data(((struct daemon *)ctx)->supervisor, device, t_ns);
 }
 
+static void begin_list(struct daemon *d);
+
+/* One line a second at most: a localisation that cannot decide jumps with every pose. */
+static void log_jump(struct daemon *d, int device, const struct pose_jump *jump)
+{
+	static const char *const what[] = {[POSE_TRACK_KEEP] = "the map goes on",
+	                                   [POSE_TRACK_IGNORE] = "ignored: the old correction is held",
+	                                   [POSE_TRACK_NEW_MAP] = "a new map begins"};
+	const int64_t t_ns = now(d);
+	char more[60] = "";
+
+	if (d->jump_told_ns && t_ns - d->jump_told_ns < JUMP_LOG_NS) {
+		d->jumps_untold++;
+		return;
+	}
+	if (d->jumps_untold)
+		snprintf(more, sizeof(more), " (and %llu jumps before it)", (unsigned long long)d->jumps_untold);
+	log_line(LOG_WARNING, "%s: the pose jumped%s by %.2f m, %.1f degrees: %s%s", d->config->device[device].name,
+	         jump->back ? " back" : "", jump->distance_m, jump->angle_rad * 57.29577951308232, what[jump->done],
+	         more);
+	d->jump_told_ns = t_ns;
+	d->jumps_untold = 0;
+}
+
+static void on_jump(void *ctx, int device, const struct pose_jump *jump)
+{
+	struct daemon *d = ctx;
+	struct buffer message = {0};
+
+	log_jump(d, device, jump);
+	control_put_jump_event(&message, d->config->device[device].name, jump);
+	tell_clients(d, &message);
+	if (jump->done != POSE_TRACK_NEW_MAP)
+		return;
+	pipeline_reset(d->pipeline);
+	worker_end(d->worker);
+	begin_list(d);
+}
+
 static void on_tick(uv_timer_t *timer)
 {
 	struct daemon *d = timer->data;
@@ -313,9 +360,61 @@ static void note_latencies(struct daemon *d, const struct worker_result *result)
 		d->latency_ms[d->latencies++ % LATENCIES] = (double)(t_ns - result->arrival_ns[i]) / 1e6;
 }
 
+static void make_map_id(struct daemon *d)
+{
+	const int64_t t_ns = now(d);
+
+	if (getrandom(d->map_id, sizeof(d->map_id), GRND_NONBLOCK) < 0)
+		memcpy(d->map_id, &t_ns, sizeof(t_ns)); /* early at boot: the time will do */
+}
+
+static void on_saved(void *ctx, const struct archive_result *result)
+{
+	struct daemon *d = ctx;
+	struct buffer message = {0};
+
+	if (result->file)
+		log_line(LOG_INFO, "the map that ended was saved as %s, %u triangles", result->file, result->triangles);
+	else
+		log_line(LOG_ERR, "the map that ended was not saved: %s", result->error);
+	control_put_saved_event(&message, result->map, result->file, result->error);
+	tell_clients(d, &message);
+}
+
+/* Everything of the old map is with the publisher. */
+static void end_map(struct daemon *d)
+{
+	struct archive_result result = {0};
+	struct publisher_stats stats;
+	struct publisher_old *old;
+	struct buffer message = {0};
+	char map[33], error[200] = "out of memory";
+	uint8_t before[16];
+
+	memcpy(before, d->map_id, sizeof(before));
+	for (int i = 0; i < 16; i++)
+		snprintf(map + 2 * i, 3, "%02x", before[i]);
+	make_map_id(d);
+	old = publisher_begin_map(d->publisher, d->map_id);
+	publisher_stats(d->publisher, &stats);
+	control_put_map_event(&message, d->map_id, stats.generation, before);
+	tell_clients(d, &message);
+	if (old && publisher_old_count(old) == 0) {
+		publisher_old_destroy(old);
+		snprintf(error, sizeof(error), "nothing was in it");
+	} else if (old && archive_save(d->archive, before, old, error)) {
+		return;
+	}
+	result.map = map;
+	result.error = error;
+	on_saved(d, &result);
+}
+
 static int publish(struct daemon *d, const struct worker_result *result)
 {
-	if (result->reset)
+	if (result->ended)
+		end_map(d);
+	else if (result->reset)
 		publisher_reset(d->publisher);
 	d->grid = result->grid;
 	d->field = result->field;
@@ -382,6 +481,7 @@ static void fill_devices(const struct daemon *d, struct control_status *s)
 		s->device[i].fixed = d->config->device[i].fixed;
 		pipeline_counters(d->pipeline, i, &s->device[i].counters);
 		pipeline_timing(d->pipeline, i, &s->device[i].timing);
+		pipeline_track(d->pipeline, i, &s->device[i].track);
 	}
 	s->rows.rate = rate(d->rows[last], d->rows[first], span);
 }
@@ -602,7 +702,7 @@ static bool begin_parts(struct daemon *d)
 	                                       .memory = config->map.memory},
 	                               .ready = on_worker_ready,
 	                               .ctx = &d->results};
-	struct pipeline_sink sink = {d, take_row, on_not_applied, on_flush, on_reply, on_data, NULL};
+	struct pipeline_sink sink = {d, take_row, on_not_applied, on_flush, on_reply, on_data, on_jump};
 	struct supervisor_host host = {d, watch_device, on_record, log_device};
 
 	memcpy(publisher.map_id, d->map_id, sizeof(publisher.map_id));
@@ -612,7 +712,8 @@ static bool begin_parts(struct daemon *d)
 	d->worker = worker_create(&worker);
 	d->pipeline = pipeline_create(config, &sink);
 	d->supervisor = supervisor_create(config, d->driver, &host);
-	return d->publisher && d->worker && d->pipeline && d->supervisor;
+	d->archive = archive_create(&d->loop, config->map.archive, config->map.cell_m, on_saved, d);
+	return d->publisher && d->worker && d->pipeline && d->supervisor && d->archive;
 }
 
 static int begin(struct daemon *d, const struct daemon_options *options)
@@ -640,6 +741,7 @@ static void finish(struct daemon *d)
 	server_destroy(d->server);
 	pipeline_destroy(d->pipeline);
 	publisher_destroy(d->publisher);
+	archive_stop(d->archive);
 	journal_destroy(d->journal);
 }
 
@@ -667,8 +769,7 @@ int daemon_run(const struct config *config, const struct daemon_options *options
 	d->error = error;
 	d->wall_offset_ns = d->clock_offset_ns = wall_clock_first_offset();
 	d->started_ns = now(d);
-	if (getrandom(d->map_id, sizeof(d->map_id), GRND_NONBLOCK) < 0)
-		memcpy(d->map_id, &d->started_ns, sizeof(d->started_ns)); /* early at boot: the time will do */
+	make_map_id(d);
 	begin_handles(d);
 	r = begin(d, options);
 	if (r == 0) {
@@ -684,6 +785,7 @@ int daemon_run(const struct config *config, const struct daemon_options *options
 	finish(d);
 	uv_run(&d->loop, UV_RUN_DEFAULT);
 	uv_loop_close(&d->loop);
+	archive_destroy(d->archive);
 	free(d);
 	return r;
 }

@@ -362,15 +362,85 @@ static void drop_entries(struct publisher *p)
 		memset(p->slot, 0, p->slots * sizeof(*p->slot));
 }
 
-void publisher_reset(struct publisher *p)
+static void abort_batches(struct publisher *p)
 {
 	for (struct publisher_client *client = p->clients; client; client = client->next) {
 		batch_abort(client);
 		client->greeted = false;
 	}
+}
+
+void publisher_reset(struct publisher *p)
+{
+	abort_batches(p);
 	drop_entries(p);
 	p->generation++;
 	p->step = 0;
+}
+
+/* A map that has ended */
+
+struct publisher_old {
+	size_t n;
+	struct sheet *sheet[];
+};
+
+/* The sheet of an entry, whose only owner is then the caller; one that a client is being sent is copied, since references
+ * are counted by the loop alone. NULL when memory is out. */
+static struct sheet *detach_sheet(struct publisher *p, struct entry *entry)
+{
+	struct sheet *sheet = entry->sheet, *copy;
+
+	if (sheet->references > 1) {
+		copy = malloc(sizeof(*copy) + sheet->len);
+		if (copy)
+			memcpy(copy, sheet, sizeof(*copy) + sheet->len);
+		return copy;
+	}
+	sheet->references++;
+	change_entry(p, entry, NULL);
+	p->stats.pinned -= sheet->len; /* it lives, but not here */
+	return sheet;
+}
+
+struct publisher_old *publisher_begin_map(struct publisher *p, const uint8_t map_id[16])
+{
+	struct publisher_old *old = malloc(sizeof(*old) + p->stats.patches * sizeof(struct sheet *));
+
+	abort_batches(p);
+	if (old)
+		old->n = 0;
+	for (struct entry *entry = p->oldest; entry && old; entry = entry->newer) {
+		struct sheet *sheet = entry->sheet ? detach_sheet(p, entry) : NULL;
+
+		if (sheet)
+			old->sheet[old->n++] = sheet;
+		else if (entry->sheet) { /* half a map is none */
+			publisher_old_destroy(old);
+			old = NULL;
+		}
+	}
+	publisher_reset(p);
+	memcpy(p->params.map_id, map_id, sizeof(p->params.map_id));
+	return old;
+}
+
+size_t publisher_old_count(const struct publisher_old *old)
+{
+	return old->n;
+}
+
+const uint8_t *publisher_old_frame(const struct publisher_old *old, size_t i, size_t *ret_len)
+{
+	*ret_len = old->sheet[i]->len;
+	return old->sheet[i]->bytes;
+}
+
+void publisher_old_destroy(struct publisher_old *old)
+{
+	for (size_t i = 0; old && i < old->n; i++)
+		free(old->sheet[i]);
+	free(old);
 }
 
 /* What a client is sent */

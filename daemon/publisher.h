@@ -29,6 +29,14 @@ int publisher_publish(struct publisher *, uint64_t step, struct patch *const *, 
 /* The map begins anew: empty, a new generation; every client gets HELLO and a batch with `reset`. */
 void publisher_reset(struct publisher *);
 
+/* The same, and it is another map, `map_id`. What the old one was, as PATCH frames, is the caller's, and may go to another
+ * thread; NULL when memory is out. */
+struct publisher_old;
+struct publisher_old *publisher_begin_map(struct publisher *, const uint8_t map_id[16]);
+size_t publisher_old_count(const struct publisher_old *);
+const uint8_t *publisher_old_frame(const struct publisher_old *, size_t i, size_t *ret_len);
+void publisher_old_destroy(struct publisher_old *);
+
 struct publisher_stats {
 	uint64_t step;
 	uint32_t generation;

@@ -1,6 +1,6 @@
 /* The mapping thread behind its queue.
  *
- *   loop:    worker_row, worker_flush, worker_reset ──► queue ──► worker: map_row, map_flush, a new map
+ *   loop:    worker_row, worker_flush, worker_reset, worker_end ──► queue ──► worker: map_row, map_flush, a new map
  *   loop:    worker_take ◄── results ◄── worker: map_take_dirty, map_mesh_patch
  *
  * Meshes are made when the queue is empty, so that a change is seen as soon as it can be, and at the latest after
@@ -18,7 +18,7 @@
 
 #include "daemon/crew.h"
 
-enum item_kind { ITEM_ROW, ITEM_FLUSH, ITEM_RESET };
+enum item_kind { ITEM_ROW, ITEM_FLUSH, ITEM_RESET, ITEM_END };
 
 struct item {
 	enum item_kind kind;
@@ -26,7 +26,7 @@ struct item {
 	int64_t arrival_ns;
 };
 
-/* Between two rows stand at most a reset and a flush before and after it: see push_control. */
+/* Between two rows stand at most a flush, a reset and an end: see push_control. */
 #define ITEMS_MAX (4 * (WORKER_ROWS_MAX + 1))
 
 struct worker {
@@ -94,6 +94,17 @@ static bool begin_map(struct worker *w)
 	return w->map != NULL;
 }
 
+static bool publish(struct worker *w);
+
+/* False when memory is out. */
+static bool begin_anew(struct worker *w, bool ended)
+{
+	w->result->reset = true;
+	w->result->ended = ended;
+	w->result->arrivals = 0;
+	return begin_map(w);
+}
+
 static bool apply(struct worker *w, const struct item *item)
 {
 	switch (item->kind) {
@@ -106,9 +117,10 @@ static bool apply(struct worker *w, const struct item *item)
 		map_flush(w->map);
 		return true;
 	case ITEM_RESET:
-		w->result->reset = true;
-		w->result->arrivals = 0;
-		return begin_map(w);
+		return begin_anew(w, false);
+	case ITEM_END:
+		map_flush(w->map);
+		return publish(w) && (w->stop || begin_anew(w, true));
 	}
 	return false;
 }
@@ -289,8 +301,8 @@ bool worker_row(struct worker *w, struct row *row, int64_t arrival_ns)
 	return taken;
 }
 
-/* A flush after a flush or a reset, and a reset after a reset, change nothing; so at most flush, reset stand in a row.
- */
+/* Without rows between them, what comes after an equal or a stronger one changes nothing; so at most flush, reset, end stand
+ * in a row. */
 static void push_control(struct worker *w, enum item_kind kind)
 {
 	enum item_kind last = ITEM_ROW;
@@ -298,7 +310,7 @@ static void push_control(struct worker *w, enum item_kind kind)
 	pthread_mutex_lock(&w->lock);
 	if (w->items > 0)
 		last = w->item[(w->first + w->items - 1) % ITEMS_MAX].kind;
-	if (last == ITEM_ROW || (last == ITEM_FLUSH && kind == ITEM_RESET))
+	if (last < kind)
 		push(w, (struct item){.kind = kind});
 	pthread_mutex_unlock(&w->lock);
 }
@@ -311,6 +323,11 @@ void worker_flush(struct worker *w)
 void worker_reset(struct worker *w)
 {
 	push_control(w, ITEM_RESET);
+}
+
+void worker_end(struct worker *w)
+{
+	push_control(w, ITEM_END);
 }
 
 struct worker_result *worker_take(struct worker *w)

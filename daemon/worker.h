@@ -21,6 +21,7 @@ struct worker_params {
 /* A dirty set, whole: what the map at `step` differs in from the result before. */
 struct worker_result {
 	bool reset; /* the map began anew before this: all earlier patches are void */
+	bool ended; /* ... and the one before it was whole: it came to its end (worker_end) */
 	uint64_t step;
 	int64_t t_ns; /* of the newest applied row */
 	size_t patches;
@@ -47,10 +48,12 @@ void worker_destroy(struct worker *); /* ends after the patch at hand; what is q
 
 /* Takes the row over and is true, or false when the queue is full. */
 bool worker_row(struct worker *, struct row *, int64_t arrival_ns);
-/* Both go through the queue in their place, and are never refused: two in a row are one, so they are bounded as rows
+/* These go through the queue in their place, and are never refused: two in a row are one, so they are bounded as rows
  * are. */
 void worker_flush(struct worker *);
 void worker_reset(struct worker *);
+/* The map comes to its end: what it still lacks is folded and handed over, then it begins anew. */
+void worker_end(struct worker *);
 
 /* The oldest result, the caller's; NULL when there is none. */
 struct worker_result *worker_take(struct worker *);

@@ -23,14 +23,16 @@
 #define ANSWER_MS  2000
 #define CONNECT_MS 2000
 #define COLUMNS    100 /* where nobody knows */
-#define FOLD       4   /* the indentation of what did not fit into a line */
-#define OTHERS_MAX 100 /* lines that may stand before an answer */
+#define DEGREES    57.29577951308232
+#define FOLD       4    /* the indentation of what did not fit into a line */
+#define OTHERS_MAX 2000 /* lines that may stand before an answer */
 
 enum { OPTION_ONCE = 256, OPTION_JSON };
 
 struct watch {
 	const char *address;
 	bool once, json, terminal;
+	bool told; /* that events are wanted, on this connection */
 	struct client *client;
 	char lost[CLIENT_ERROR_MAX]; /* why there is no client; empty: not said yet */
 };
@@ -147,6 +149,10 @@ static void put_details(FILE *out, json_t *device)
 		put_counts(out, member(device, "counters"), stamps ? "; " : "  ");
 	if (stamps || counted)
 		fputc('\n', out);
+	if (member(device, "sigma.position"))
+		fprintf(out, "  place within %.3f m, heading within %.2f degrees (sigma); jumps %s\n",
+		        number(device, "sigma.position"), number(device, "sigma.heading") * DEGREES,
+		        grouped(number(device, "jumps")));
 }
 
 static void put_device(FILE *out, json_t *device)
@@ -339,6 +345,7 @@ static void show_loss(struct watch *watch, const char *why)
 	if (watch->client) {
 		client_close(watch->client);
 		watch->client = NULL;
+		watch->told = false;
 	}
 	if (strcmp(watch->lost, why) == 0)
 		return;
@@ -351,6 +358,21 @@ static void show_loss(struct watch *watch, const char *why)
 	} else {
 		fprintf(stderr, "facet: %s%s\n", why, watch->once ? "" : "; trying again every second");
 	}
+}
+
+/* As JSON, and for longer than one answer, events are shown as they come: between two answers they wait in the socket. */
+static bool shows_events(const struct watch *watch)
+{
+	return watch->json && !watch->once;
+}
+
+static bool is_event(const char *class)
+{
+	static const char *const events[] = {"DEVICE", "CLOCK", "JUMP", "MAP", "SAVED"};
+	for (size_t i = 0; i < sizeof(events) / sizeof(events[0]); i++)
+		if (strcmp(class, events[i]) == 0)
+			return true;
+	return false;
 }
 
 /* The next line that is a status or an error; a greeting and events may stand before it. NULL with a sentence. */
@@ -374,6 +396,10 @@ static json_t *read_answer(struct watch *watch, const char **ret_line, char erro
 			json_decref(json);
 			return NULL;
 		}
+		if (shows_events(watch) && is_event(class)) {
+			puts(*ret_line);
+			fflush(stdout);
+		}
 		json_decref(json);
 	}
 	snprintf(error, CLIENT_ERROR_MAX, "%s: no status among many answers", client_address(watch->client));
@@ -388,6 +414,9 @@ static int ask(struct watch *watch, char error[CLIENT_ERROR_MAX])
 		watch->client = client_open(watch->address, CONNECT_MS, error);
 	if (!watch->client)
 		return -ENOTCONN;
+	if (shows_events(watch) && !watch->told && client_say(watch->client, "?WATCH={\"enable\":true}", error))
+		return -ENOTCONN;
+	watch->told = true;
 	const int status = client_say(watch->client, "?STATUS", error);
 	if (status)
 		return status;
@@ -469,7 +498,7 @@ int watch_main(int argc, char **argv)
 {
 	static const struct argp_option options[] = {
 	    {"once", OPTION_ONCE, NULL, 0, "show it once; status 1 where no daemon answers", 0},
-	    {"json", OPTION_JSON, NULL, 0, "the status as JSON, one line a second", 0},
+	    {"json", OPTION_JSON, NULL, 0, "the status as JSON, one line a second, and events as they come", 0},
 	    {0}};
 	static const struct argp argp = {
 	    options,

@@ -228,9 +228,11 @@ static void settle_jump(struct pipeline *p)
 	if (!p->jump.seen)
 		return;
 	p->jump.seen = false;
-	if (p->jump.jump.done == POSE_TRACK_NEW_MAP)
+	if (p->jump.jump.done == POSE_TRACK_NEW_MAP) {
 		for (int i = 0; i < p->scanners; i++)
 			sweep_new_map(p->scanner[i].sweep);
+		flush(p); /* the old map lacks nothing of what was measured in it */
+	}
 	if (p->sink.jump)
 		p->sink.jump(p->sink.ctx, p->jump.device, &p->jump.jump);
 }

@@ -10,7 +10,7 @@
 
 #include "core/trig.h"
 
-#define LATERAL_RAD (1.25 * TRIG_DEG) /* how the axis that nothing moves hangs */
+#define LATERAL_RAD (1.2 * TRIG_DEG) /* how the axis that nothing moves hangs */
 
 /* Counts without wrap and preset. */
 static double counts(const struct sim_node *n, int64_t t_ns)

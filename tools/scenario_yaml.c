@@ -148,7 +148,7 @@ static void add_canopen(struct text *text, const struct scenario_params *params)
 	add_bus(text, params);
 	add(text, " node: %d, sign: -1, sync: 10ms, heartbeat: 200ms,\n     ", SCENARIO_NODE);
 	if (params->servo == SCENARIO_CAN_ENCODER)
-		add(text, "kind: encoder, scale: 0.001deg}\n");
+		add(text, "kind: encoder, scale: 0.001deg, wrap: 1474560000}\n");
 	else if (params->servo == SCENARIO_INCLINOMETER)
 		add(text, "kind: inclinometer}\n");
 	else

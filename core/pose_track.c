@@ -32,12 +32,14 @@
 #define SLACK_RAD_S2  4.0
 #define FIRST_M_S     3.0 /* nothing is known of the speed yet */
 #define FIRST_RAD_S   3.0
-#define PIECE_M_MAX   100.0 /* of one motion */
+#define PIECE_NS_MAX  250000000LL /* of one motion that is interpolated */
+#define PIECE_M_MAX   100.0       /* of one motion */
 #define PIECE_RAD_MAX 100.0
 #define FAR_M         1e7  /* the track is held within: a square of it loses no metre */
 #define VARIANCE_MAX  1e12 /* likewise */
 #define SIGMA_MIN_M   1e-4 /* an absolute pose is not better than this where it says how good it is */
 #define SIGMA_MIN_RAD 1e-5
+#define NOISE_SIGMAS  3  /* what is weighed may be off by so many of its own */
 #define MEMORY        20 /* the track trusts itself no more than so many absolute poses */
 
 struct place { /* rigid, in three dimensions */
@@ -627,7 +629,8 @@ static void adjust(struct pose_track *k, const struct pose *pose, struct pose_tr
 {
 	const bool ahead = pose->t_ns > way_head(k)->t_ns, whole = !(pose->variance_m2 > 0 || pose->variance_rad2 > 0);
 	struct place place = shown_place(k, pose);
-	struct judgement j = {.slack_m = 0};
+	struct judgement j = {.slack_m = NOISE_SIGMAS * sqrt(pose->variance_m2),
+	                      .slack_rad = NOISE_SIGMAS * sqrt(pose->variance_rad2)};
 	bool ignored = false, jumped = false;
 	struct mark was, is;
 	uint64_t i;
@@ -747,7 +750,7 @@ void pose_track_motion(struct pose_track *k, const struct motion *m, struct pose
 	k->moved_ns = m->t_ns;
 	head = moved(k, &head, m->t_ns, m->ahead_m * share, m->turn_rad * share);
 	way_put(k, &head);
-	hand_out_mark(k, &head, m->t_ns, gap, ret);
+	hand_out_mark(k, &head, m->t_ns, gap || m->t_ns - m->from_ns > PIECE_NS_MAX, ret);
 }
 
 /* Life */

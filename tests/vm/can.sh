@@ -1,0 +1,151 @@
+# CAN in the guest, for rows: vcan0, a wire without controllers, and can0 - can1, two controllers on one wire. $scratch is a
+# folder of the row. busybox has an `ip` of its own that knows no CAN.
+ip=/bin/ip
+SERVO='{name: servo, driver: can, connect: vcan0, angle: {id: 0x181, length: 16, scale: 0.01deg}, timeout: 1s}'
+
+vcan_up() {
+    modprobe -a can_raw vcan || { echo "this kernel has no vcan"; exit 77; }
+    $ip link add vcan0 type vcan 2>/dev/null
+    $ip link set vcan0 mtu 72 up || fail "vcan0 cannot be set up"
+}
+controllers_up() {
+    modprobe -a can_raw kvaser_pci || { echo "this kernel has no kvaser_pci"; exit 77; }
+    [ -e /sys/class/net/can1 ] || { echo "this guest has no CAN controllers"; exit 77; }
+    for interface in can0 can1; do
+        controller_up $interface || fail "$interface cannot be set up"
+    done
+}
+controller_up() {
+    $ip link set "$1" down
+    $ip link set "$1" type can bitrate 500000 restart-ms 100 berr-reporting on && $ip link set "$1" up
+}
+
+# log_of_angles FRAMES: $scratch/angles.log, as `candump -L` writes it, an angle every 10 ms between -30 and 30 degrees, 37.5 a
+# second; and $scratch/truth, what it says.
+log_of_angles() {
+    /usr/bin/awk -v n="$1" -v log_file=$scratch/angles.log -v truth=$scratch/truth 'BEGIN {
+        at = -3000; step = 37
+        for (i = 0; i < n; i++) {
+            if (at + step > 3000 || at + step < -3000) step = -step
+            at += step
+            raw = at < 0 ? at + 65536 : at
+            printf "(%d.%06d) vcan0 181#%02X%02X\n", 1600000000 + int(i / 100), i % 100 * 10000, raw % 256, int(raw / 256) > log_file
+            printf "%d%09d %.12f\n", 1600000000 + int(i / 100), i % 100 * 10000000, at * 0.01 * 3.14159265358979323846 / 180 > truth
+        }
+    }'
+}
+# The log again and again; a player ends when its interface does.
+play_for_ever() {
+    while :; do
+        canplayer -I $scratch/angles.log 2>/dev/null
+        sleep 0.1
+    done &
+    player=$!
+    trap 'stop_player; stop_daemon; judge' EXIT
+}
+stop_player() {
+    [ -z "$player" ] || { kill "$player" 2>/dev/null; killall canplayer 2>/dev/null; wait "$player"; } 2>/dev/null
+    player=
+}
+player=
+
+# counts FILE KEY: of what tests/angles.c printed.
+figure() {
+    sed -n "s/^$2 //p" "$1"
+}
+below() { # figure, limit
+    /usr/bin/awk -v a="$1" -v b="$2" 'BEGIN { exit !(a != "" && a + 0 <= b + 0) }'
+}
+said_times() { # N WORDS: it is in the log so often, at least
+    [ "$(grep -c -- "$2" $scratch/log)" -ge "$1" ]
+}
+uptime_ms() {
+    sed 's/\([0-9]*\)\.\([0-9][0-9]\).*/\1\20/' /proc/uptime
+}
+
+# ---- rows ----
+
+can_log_played() {
+    vcan_up
+    log_of_angles 1500
+    configure "$SERVO"
+    start_daemon --journal $scratch/journal
+    until_true 10 test -s $scratch/journal
+    canplayer -I $scratch/angles.log || fail "canplayer: status $?"
+    sleep 1
+    stop_daemon
+    "$BUILD/tests/angles" --sequence $scratch/journal $scratch/facetd.yaml servo $scratch/truth >$scratch/figures ||
+        fail "the kept list cannot be read"
+    cat $scratch/figures
+    [ "$(figure $scratch/figures angles)" = 1500 ] || fail "$(figure $scratch/figures angles) of 1500 angles"
+    [ "$(figure $scratch/figures wrong)" = 0 ] || fail "$(figure $scratch/figures wrong) angles are wrong"
+    below 95 "$(figure $scratch/figures rate_hz)" && below "$(figure $scratch/figures rate_hz)" 101 ||
+        fail "$(figure $scratch/figures rate_hz) Hz instead of 100"
+    says 'servo: streaming' || fail "the servo was not said to stream"
+    echo "note: 1500 angles, $(figure $scratch/figures rate_hz) Hz, stamps $(figure $scratch/figures late_p99_ms) ms (p99) from the log's"
+}
+
+can_error_frames() {
+    vcan_up
+    log_of_angles 1000
+    configure "$SERVO"
+    start_daemon
+    play_for_ever
+    until_true 20 is servo state streaming || fail "the servo does not stream"
+    cansend vcan0 00000181#FFFF
+    cansend vcan0 181#R
+    cansend vcan0 181#11
+    until_true 10 at_least servo foreign 1 || fail "the extended frame of the same number is not counted"
+    until_true 10 at_least servo remote 1 || fail "the remote frame is not counted"
+    until_true 10 at_least servo short 1 || fail "the short frame is not counted"
+    cansend vcan0 20000004#0004000000000000
+    until_true 10 says 'warns of many errors' || fail "the warning is not said"
+    cansend vcan0 20000004#0020000000000000
+    until_true 10 says 'error passive' || fail "error passive is not said"
+    stop_player
+    cansend vcan0 20000040#0000000000000000
+    until_true 10 says 'bus-off' || fail "bus-off is not said"
+    until_true 10 is_lost servo || fail "a silent servo is not lost"
+    status_of servo error | grep -q bus-off || fail "the status does not say why: $(status_of servo error)"
+    cansend vcan0 20000100#0000000000000000
+    play_for_ever
+    until_true 20 is servo state streaming || fail "it does not come back after the restart"
+    until_true 10 is servo note '' || fail "the note stays: $(status_of servo note)"
+    [ "$(grep -c 'bus-off' $scratch/log)" -le 3 ] || fail "bus-off is said again and again"
+    is servo "bus off" 1 || fail "bus off is counted $(status_of servo 'bus off') times"
+}
+is_lost() {
+    [ "$(status_of "$1" state)" != streaming ]
+}
+
+can_interface_down() {
+    vcan_up
+    log_of_angles 1000
+    configure "$SERVO"
+    $ip link del vcan0
+    start_daemon
+    until_true 10 says 'there is no interface vcan0' || fail "the missing interface is not said"
+    $ip link add vcan0 type vcan
+    until_true 10 says 'vcan0 is down: `ip link set vcan0 up' || fail "the interface that is down is not said"
+    $ip link set vcan0 mtu 72 up
+    play_for_ever
+    until_true 20 said_times 1 'servo: streaming' || fail "the servo does not stream"
+    ups=
+    for time in 2 3; do
+        $ip link set vcan0 down
+        until_true 10 said_times $((time - 1)) 'lost: vcan0 was set down' || fail "the end is not said"
+        sleep 2
+        $ip link set vcan0 up
+        began=$(uptime_ms)
+        until_true 20 said_times $time 'servo: streaming' || fail "it does not come back"
+        ups="$ups $(($(uptime_ms) - began))"
+    done
+    $ip link del vcan0
+    until_true 10 says 'lost: the interface vcan0 has gone\|lost: vcan0 was set down.*$' || fail "the deletion is not said"
+    until_true 10 said_times 2 'there is no interface vcan0' || fail "that it is missing is not said"
+    $ip link add vcan0 type vcan
+    $ip link set vcan0 mtu 72 up
+    began=$(uptime_ms)
+    until_true 20 said_times 4 'servo: streaming' || fail "it does not come back after the deletion"
+    echo "note: streams again$ups ms after up, $(($(uptime_ms) - began)) ms after it was made anew"
+}

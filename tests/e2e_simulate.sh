@@ -123,10 +123,42 @@ map() {
     grep -q '^laser: profiles [1-9]' "$out/$laser.said" || fail "$laser: what the scanner did is not said"
     echo "note: the hall, $laser, after a few seconds: $(sed 's/^[^:]*: //' "$out/$laser.save")"
 }
-map lms2xx 150 2000
+map lms2xx 150 2000 --servo canopen-cyclic --odometry
 map tim 60 2000 --laser tim
-map lms1xx 150 2000 --laser lms1xx
-map lms5xx 80 2000 --laser lms5xx --encoder
+map lms1xx 150 2000 --laser lms1xx --servo can --odometry=speed
+map lms5xx 80 2000 --laser lms5xx --servo modbus-tcp --encoder
+
+# Every other servo, all at once: its angle places rows, and nothing of it is lost or refused
+try_servo() {
+    map "$1" 40 300 --servo "$1" --truth "$out/$1.truth"
+    ! grep 'servo: lost\|servo: not ready' "$out/$1.log" || fail "$1: was lost"
+    grep -q "; servo $1: angle [-0-9.]* deg, speed" "$out/$1.said" || fail "$1: what the servo did is not said"
+    [ "$(awk 'NF == 6' "$out/$1.truth" | wc -l)" -gt 500 ] || fail "$1: the truth is not written"
+    exit "$failures"
+}
+pids=
+for servo in canopen canopen-velocity encoder inclinometer fixed; do
+    (failures=0; try_servo "$servo") &
+    pids="$pids $!"
+done
+for pid in $pids; do
+    wait "$pid" || failures=$((failures + 1))
+done
+
+# A bus that goes, as the daemon sees it and says it: once each
+cat >"$out/bus.sh" <<'BUS'
+"$build/facetd" 2>"$out/bus.log" & daemon=$!
+for i in $(seq 300); do
+    [ "$(grep -ac 'facetd: servo: streaming' "$out/bus.log")" -ge 3 ] && break
+    sleep 0.1
+done
+kill -TERM $daemon
+wait $daemon
+BUS
+timeout 60 "$facet" simulate hall --endless --servo can --fault 'can: bus-off at 2s for 1s' --fault 'can: down at 5s for 1s' -- sh "$out/bus.sh" >"$out/bus.said"
+[ "$(grep -ac 'facetd: servo: streaming' "$out/bus.log")" -ge 3 ] || fail "the servo does not come back with its bus: $(cat "$out/bus.log")"
+[ "$(grep -ac 'facetd: servo: lost' "$out/bus.log")" -eq 2 ] || fail "the loss of the bus is not said once each: $(cat "$out/bus.log")"
+grep -q 'can: frames [1-9].*dropped [1-9].*errors 2' "$out/bus.said" || fail "what the bus did is not said: $(cat "$out/bus.said")"
 
 # Faults: ordered by the command line and at the socket, seen by the daemon, and recovered from
 cat >"$out/faults.sh" <<'FAULTS'

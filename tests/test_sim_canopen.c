@@ -14,6 +14,7 @@
 
 #include "core/trig.h"
 #include "drivers/can_wire.h"
+#include "tests/captures.h"
 #include "tools/sim_canopen.h"
 
 #define DEG     TRIG_DEG
@@ -1068,6 +1069,120 @@ static void a_run_is_the_same_every_time(void **state)
 	}
 }
 
+/* One line of a capture, "(0.004000) can0 602#40..." or "  can0  602   [8]  40 ...". */
+static bool captured(const char *line, struct can_frame_at *ret)
+{
+	const char *at = strchr(line, '#');
+	char data[20] = "";
+	unsigned id;
+	int n = 0;
+
+	if (at && sscanf(line, "(%*f) can0 %x", &id) == 1) {
+		snprintf(data, sizeof data, "%.16s", at + 1);
+	} else if ((at = strstr(line, "can0")) && sscanf(at, "can0 %x [%*d] %n", &id, &n) == 1 && n > 0) {
+		int len = 0;
+
+		for (const char *c = at + n; *c && len < 16; c++)
+			if (*c != ' ')
+				data[len++] = *c;
+		data[len] = 0;
+	} else {
+		return false;
+	}
+	*ret = (struct can_frame_at){.id = id};
+	ret->len = (uint8_t)hex(data, ret->data);
+	return true;
+}
+
+/* Requests of the capture to node `node` are made to ours, which must take each of them, and answer as the real drive did
+ * where its answer was captured: command, index and sub, device type, abort codes. Returns how many were made. */
+static int replay(const char *name, uint32_t node, int *ret_compared, int *ret_refused)
+{
+	struct can_frame_at pending[64], frame;
+	size_t len;
+	char *text = (char *)capture_file(name, &len), *save = NULL;
+	int waiting = 0, asked = 0;
+
+	for (char *line = strtok_r(text, "\n", &save); line; line = strtok_r(NULL, "\n", &save)) {
+		if (!captured(line, &frame))
+			continue;
+		if (frame.id == 0x600 + node) {
+			int from = bed.n;
+			const struct can_frame_at *answer;
+
+			say(frame.id, frame.data, frame.len);
+			run(2 * MS);
+			answer = last(0x580 + node, from);
+			assert_non_null(answer);
+			assert_memory_equal(answer->data + 1, frame.data + 1, 3);
+			*ret_refused += answer->data[0] == 0x80;
+			if (waiting < 64)
+				pending[waiting++] = *answer;
+			asked++;
+		} else if (frame.id == 0x580 + node) {
+			for (int i = 0; i < waiting; i++) {
+				if (memcmp(pending[i].data + 1, frame.data + 1, 3) != 0)
+					continue;
+				assert_int_equal(pending[i].data[0], frame.data[0]);
+				if (frame.data[0] == 0x80 || number(frame.data) >> 8 == 0x1000)
+					assert_int_equal(number(pending[i].data + 4), number(frame.data + 4));
+				pending[i].data[1] = pending[i].data[2] = 0xff;
+				(*ret_compared)++;
+				break;
+			}
+		} else if (frame.id == 0 || (frame.id & 0x780) == 0x200 || (frame.id & 0x780) == 0x300) {
+			say(frame.id, frame.data, frame.len);
+			run(100 * MS);
+		}
+	}
+	free(text);
+	return asked;
+}
+
+static void the_start_up_of_two_real_drives_goes_the_same_way_with_simulated_ones(void **state)
+{
+	static const char log[] = "can/canopen_cia402_two_drives_startup.log";
+	static const char aborts[] = "can/oriental_motor_simulator_sdo_aborts.candump.txt";
+	size_t len;
+	uint8_t *text = capture_file(log, &len);
+	int asked = 0, compared = 0, refused = 0;
+
+	(void)state;
+	if (!text) {
+		printf("note: no captures: the start-up of real drives was not compared\n");
+		skip();
+	}
+	free(text);
+	for (int node = 1; node <= 2; node++) {
+		int from;
+
+		begin_with(&(struct sim_canopen_params){.kind = SIM_CANOPEN_DRIVE, .node = node});
+		asked += replay(log, (uint32_t)node, &compared, &refused);
+		assert_int_equal(refused, 0);
+		assert_int_equal(sim_canopen_nmt_state(&bed.device), 0x05);
+		from = bed.n;
+		say_sync();
+		run(5 * MS);
+		/* the process data that it was told to send: as long as the real drives' */
+		assert_int_equal(last(0x180u + (uint32_t)node, from)->len, 3);
+		assert_int_equal(last(0x280u + (uint32_t)node, from)->len, 8);
+		assert_int_equal(last(0x380u + (uint32_t)node, from)->len, 8);
+		/* a fault, and its statusword is the real one's but for the maker's bit 14 */
+		order("fault", 0x8100, 0, true);
+		from = bed.n;
+		say_sync();
+		run(5 * MS);
+		assert_int_equal(last(0x180u + (uint32_t)node, from)->data[0], 0x38);
+		assert_int_equal(last(0x180u + (uint32_t)node, from)->data[1] & 0xbf, 0x02);
+		assert_int_equal(number(last(0x380u + (uint32_t)node, from)->data + 4) >> 16, 0x8100);
+	}
+	begin_with(&(struct sim_canopen_params){.kind = SIM_CANOPEN_DRIVE, .node = 1});
+	asked += replay(aborts, 1, &compared, &refused);
+	assert_int_equal(refused, 2);
+	assert_true(asked > 80 && compared >= 10);
+	printf("note: start-up of two real drives: %d requests taken, %d answers alike;\n", asked, compared);
+}
+
 static int finish(void **state)
 {
 	(void)state;
@@ -1102,6 +1217,7 @@ int main(void)
 	    cmocka_unit_test(two_nodes_stand_on_one_axis),
 	    cmocka_unit_test(whatever_is_on_the_bus_it_lives),
 	    cmocka_unit_test(a_run_is_the_same_every_time),
+	    cmocka_unit_test(the_start_up_of_two_real_drives_goes_the_same_way_with_simulated_ones),
 	};
 
 	return cmocka_run_group_tests(tests, NULL, finish);

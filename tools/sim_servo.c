@@ -167,7 +167,7 @@ static uint16_t crc16(const uint8_t *bytes, size_t len)
 	return crc;
 }
 
-/* TCP has no check sum of its own: a corrupt answer carries another protocol's id, which must be 0. */
+/* TCP has no check sum of its own: a corrupt answer there is one to another request. */
 static size_t put_answer(const struct sim_servo *s, const uint8_t *request, const struct sim_drive_answer *answer,
                          uint8_t *ret)
 {
@@ -179,8 +179,8 @@ static size_t put_answer(const struct sim_servo *s, const uint8_t *request, cons
 	n = at + put_pdu(&answer->transaction, ret + at);
 	if (s->port) {
 		memcpy(ret, request, 2);
-		ret[2] = 0;
-		ret[3] = corrupt;
+		ret[1] ^= corrupt ? 0x55 : 0;
+		ret[2] = ret[3] = 0;
 		ret[4] = (uint8_t)((n - 6) >> 8);
 		ret[5] = (uint8_t)(n - 6);
 		return n;

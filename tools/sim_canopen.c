@@ -32,10 +32,11 @@ static const char *const sensor_kinds[] = {"heartbeat", "silent",    "power cycl
 
 void sim_node_send(struct sim_node *n, uint32_t id, const uint8_t *bytes, uint8_t len, int64_t t_ns)
 {
-	struct can_frame_at *frame = &n->queue[n->queued].frame;
+	struct can_frame_at *frame;
 
-	if (!n->powered || n->queued == SIM_NODE_QUEUE || sim_fault_due(&n->fault[SIM_FAULT_SILENT]))
+	if (!n->powered || n->queued >= SIM_NODE_QUEUE || sim_fault_due(&n->fault[SIM_FAULT_SILENT]))
 		return;
+	frame = &n->queue[n->queued].frame;
 	memset(frame, 0, sizeof *frame);
 	frame->id = id;
 	frame->len = len;

@@ -348,8 +348,10 @@ static void print_drive(const struct play *p, char text[TEXT_MAX])
 	text[0] = 0;
 	if (!p->bench->speed)
 		return;
-	if (p->stood_ns < 0 || p->row->from_start)
-		snprintf(text, TEXT_MAX, "%s | ", p->stood_ns < 0 ? "goes on" : "");
+	if (p->row->from_start)
+		snprintf(text, TEXT_MAX, "%s | ", p->row->drive == DRIVE_HALTS ? "stands" : "sweeps");
+	else if (p->stood_ns < 0)
+		snprintf(text, TEXT_MAX, "goes on | ");
 	else if (p->still_ns >= 0)
 		snprintf(text, TEXT_MAX, "stands after %lld | ", (long long)((p->stood_ns - p->begin_ns) / RIG_MS));
 	else

@@ -9,6 +9,7 @@
 
 #include "core/trig.h"
 #include "tools/sim_can.h"
+#include "tools/sim_canopen.h"
 
 #define ACCELERATION (300 * TRIG_DEG)
 #define NODE         5
@@ -107,8 +108,9 @@ static void add_servo(const struct robot_params *p)
 		    NODE, mode[p->servo], keys);
 		break;
 	case ROBOT_ENCODER:
-		add("  - {name: servo, driver: canopen, connect: can0, node: %d, scale: 0.001deg, sign: -1%s}\n", NODE,
-		    keys);
+		add("  - {name: servo, driver: canopen, connect: can0, node: %d, scale: 0.001deg, sign: -1, wrap: "
+		    "360000%s}\n",
+		    NODE, keys);
 		break;
 	case ROBOT_INCLINOMETER:
 		add("  - {name: servo, driver: canopen, connect: can0, node: %d, sign: -1%s}\n", NODE, keys);
@@ -172,9 +174,15 @@ static struct config_signal angle_signal(void)
 
 static void attach_can(struct rig *rig, const struct robot_params *p)
 {
+	static const enum sim_canopen_kind kind[] = {
+	    [ROBOT_ENCODER] = SIM_CANOPEN_ENCODER, [ROBOT_INCLINOMETER] = SIM_CANOPEN_INCLINOMETER, [ROBOT_RTU] = 0};
 	struct sim_can_angle_params angle = {
 	    .signal = angle_signal(), .period_ns = 5 * RIG_MS, .angle = axis_angle, .seed = p->rig.seed};
-	const int r = sim_can_angle_create(&angle, rig_epoch_ns(rig), &servo_brain);
+	struct sim_canopen_params node = {
+	    .kind = kind[p->servo], .node = NODE, .axis = &axis, .factory = true, .seed = p->rig.seed};
+	const int64_t t_ns = rig_epoch_ns(rig);
+	const int r = p->servo == ROBOT_CAN ? sim_can_angle_create(&angle, t_ns, &servo_brain)
+	                                    : sim_canopen_create(&node, t_ns, &servo_brain);
 
 	if (r < 0)
 		exit(1);

@@ -151,9 +151,8 @@ static void swept_by_the_driver(enum robot_servo servo)
 static void a_servo_on_any_bus_is_swept_and_its_points_lie_where_the_beams_ended(void **state)
 {
 	(void)state;
-	swept_by_the_driver(ROBOT_CAN);
-	swept_by_the_driver(ROBOT_RTU);
-	swept_by_the_driver(ROBOT_TCP);
+	for (int servo = 0; servo < ROBOT_SERVOS; servo++)
+		swept_by_the_driver((enum robot_servo)servo);
 }
 
 int main(void)

@@ -161,8 +161,11 @@ static void post(struct sim_node *n, int pdo, const struct setting *s, const uin
 	}
 	if (sim_fault_due(&n->fault[SIM_FAULT_LATE]))
 		t_ns += (int64_t)(sim_fault_value(&n->fault[SIM_FAULT_LATE], 3.0) * (double)MS);
-	n->counts.sent += carries_position(s);
+	const int queued = (int)n->queued;
+
 	sim_node_send(n, s->cob & CANOPEN_COB_ID, bytes, len, t_ns);
+	if (carries_position(s))
+		*((int)n->queued > queued ? &n->counts.sent : &n->counts.dropped) += 1;
 }
 
 void sim_node_pdo_written(struct sim_node *n, const struct sim_node_object *o, int64_t t_ns)

@@ -1,365 +1,302 @@
-/* The bus: libmodbus blocks, so each bus has one thread that waits for it, and the loop never does (design D3).
+/* The bus: libmodbus blocks, so each line or connection has one thread that waits for it, and the loop never does
+ * (design D3). Devices with the same `connect` share it.
  *
- *   loop  --- wishes to write --->  thread  --- requests --->  device
- *         <-- completed records --          <--- answers ----
+ *   loop  --- wishes ----------------->  thread  --- requests --->  device
+ *         <-- completed records -------          <--- answers ----
  *
- * The two speak over a pair of sequenced-packet sockets: one message is one record (modbus_wire.h), and closing the
- * loop's end is the message that ends the thread; nobody joins it. It connects by itself, so a host that does not answer
- * costs the loop nothing. When the bus is lost it closes the device first and then says so with a message of four bytes,
- * a negative errno; whoever opens anew (the supervisor, with its back-off) therefore finds the line free. A lock on a
- * serial line keeps a second program from talking in between.
+ * The loop's end of each device and the thread speak over a pair of sequenced-packet sockets: one message is one record
+ * (modbus_wire.h). Closing the loop's end is the message that the device leaves the bus; with the last one the thread
+ * ends, nobody joins it. It connects by itself, so a host that does not answer costs the loop nothing. When the bus is
+ * lost it closes the line first and then says so to all with a message of four bytes, a negative errno; whoever opens
+ * anew (the supervisor, with its back-off) therefore finds the line free.
  *
- * An answer that comes after its time-out must never be taken for the answer to the next request. TCP numbers its
- * answers, yet libmodbus only notices a wrong number: the connection is given up. A serial line has no numbers: the
- * thread listens until the line was silent for a whole response time, and gives up after three failures in a row.
+ * Fairness. In each round every device may have one wish and one poll of its angle; the next round begins with the next
+ * device. A device that does not answer would hold up the others for its time-out: on a shared bus that is shorter, and
+ * shorter still for one that never answered; after a failure it is left alone until its answer can no more come, and
+ * after the third in a row (the first, if it never answered) it alone is told that it is lost. So an absent device costs
+ * the others PROBE_US each time that it is tried again, which is once a second. Its late answer carries its own unit,
+ * and is refused by whoever waits for another's; what is still to come then is listened away.
  *
  * The thread stamps with CLOCK_MONOTONIC. The loop's clock is that plus a constant, learned at each read as the largest
  * difference seen: the loop took its time before the read, so the difference is never too large. */
-#include "drivers/modbus_parts.h"
-
 #include <errno.h>
-#include <fcntl.h>
-#include <modbus.h>
 #include <poll.h>
 #include <pthread.h>
 #include <signal.h>
 #include <stdio.h>
 #include <stdlib.h>
 #include <string.h>
-#include <sys/file.h>
-#include <sys/select.h>
+#include <sys/eventfd.h>
 #include <sys/socket.h>
-#include <time.h>
 #include <unistd.h>
 
-#define RESPONSE_US    500000 /* busy machines were seen to sleep for 0.4 s */
-#define BYTE_US        100000
-#define CONNECT_S      1
-#define FAILURES_MAX   3
-#define SILENCE_MIN_NS 1750000 /* between frames above 19200 Bd */
-#define BAUD_DEFAULT   115200
+#include "drivers/modbus_parts.h"
+
+#define RESPONSE_US  500000 /* busy machines were seen to sleep for 0.4 s */
+#define SHARED_US    200000 /* of a device that is not alone: shorter than others' watchdogs */
+#define PROBE_US     100000 /* ... and never answered */
+#define FAILURES_MAX 3
+#define PATIENCE_NS  INT64_C(5000000000) /* a line that opens for longer hangs */
+#define WRITE_MAX    123                 /* registers, the standard's limit */
 
 struct link {
 	int fd;
 	char connect[CONFIG_TEXT_MAX];
 	int unit;
+	uint64_t bus; /* its number */
 	bool offset_known;
 	int64_t offset_ns; /* the loop's clock minus CLOCK_MONOTONIC */
 };
 
-struct bus { /* the thread's own; it frees it */
+struct member { /* a device on a bus */
 	int fd;
-	int crowd; /* its place among those of its device */
 	struct config_device device;
-	modbus_t *modbus;
-	bool serial;
-	int64_t silence_ns, free_ns; /* the line may be used from then on */
-	int failures;
+	int64_t poll_ns, quiet_ns; /* its next poll; it is asked nothing before quiet_ns */
+	int failures;              /* in a row */
+	bool answered, ready, hung, gone;
 };
 
-/* Threads of each device that have not ended. One that is closed ends within seconds, unless a name server never answers:
- * nothing can wake it there, and each new try would leave one more. */
-static struct {
-	char device[CONFIG_NAME_MAX];
-	int threads; /* 0: the place is free */
-} crowd[CONFIG_DEVICES_MAX];
-static pthread_mutex_t crowd_lock = PTHREAD_MUTEX_INITIALIZER;
+struct bus {
+	int wake; /* eventfd: somebody joins */
+	struct modbus_line line;
+	struct member member[CONFIG_DEVICES_MAX]; /* the thread's own */
+	int members, turn;
+	/* Under the lock. */
+	uint64_t number;
+	int links; /* of the loop that were not closed */
+	char connect[CONFIG_TEXT_MAX];
+	struct member joiner[CONFIG_DEVICES_MAX];
+	int joiners;
+	bool opening;
+	int64_t since_ns;
+};
 
-/* Its place, or -EBUSY: too many of them wait already. */
-static int crowd_join(const char *device)
-{
-	int place = -1;
+static pthread_mutex_t lock = PTHREAD_MUTEX_INITIALIZER;
+static struct bus *buses[CONFIG_DEVICES_MAX]; /* that can be joined; one for each `connect` */
+static uint64_t buses_begun;
 
-	pthread_mutex_lock(&crowd_lock);
-	for (int i = 0; i < CONFIG_DEVICES_MAX; i++)
-		if (crowd[i].threads > 0 && strcmp(crowd[i].device, device) == 0)
-			place = i;
-	for (int i = 0; i < CONFIG_DEVICES_MAX && place < 0; i++)
-		if (crowd[i].threads == 0)
-			place = i;
-	if (place >= 0 && crowd[place].threads < MODBUS_THREADS_MAX) {
-		snprintf(crowd[place].device, sizeof crowd[place].device, "%s", device);
-		crowd[place].threads++;
-	} else {
-		place = -EBUSY;
-	}
-	pthread_mutex_unlock(&crowd_lock);
-	return place;
-}
-
-static void crowd_leave(int place)
-{
-	pthread_mutex_lock(&crowd_lock);
-	crowd[place].threads--;
-	pthread_mutex_unlock(&crowd_lock);
-}
-
-static int64_t monotonic_ns(void)
-{
-	struct timespec ts;
-
-	clock_gettime(CLOCK_MONOTONIC, &ts);
-	return (int64_t)ts.tv_sec * 1000000000 + ts.tv_nsec;
-}
-
-static bool is_serial(const char *connect)
-{
-	return strchr(connect, '/') != NULL;
-}
-
-/* "host:port" or "[v6]:port" in two parts; false where it is neither. */
-static bool split_address(const char *connect, char host[CONFIG_TEXT_MAX], char port[8])
-{
-	const char *colon = strrchr(connect, ':');
-	size_t len;
-
-	if (!colon || colon == connect || strlen(colon + 1) < 1 || strlen(colon + 1) > 5)
-		return false;
-	strcpy(port, colon + 1);
-	len = (size_t)(colon - connect);
-	if (connect[0] == '[' && connect[len - 1] == ']' && len > 2) {
-		connect++;
-		len -= 2;
-	}
-	memcpy(host, connect, len);
-	host[len] = '\0';
-	return true;
-}
-
-static int errno_of_modbus(void)
-{
-	if (errno >= MODBUS_ENOBASE)
-		return EPROTO;
-	return errno ? errno : EIO;
-}
-
-static void sleep_until(int64_t t_ns)
-{
-	struct timespec ts = {.tv_sec = t_ns / 1000000000, .tv_nsec = t_ns % 1000000000};
-
-	while (clock_nanosleep(CLOCK_MONOTONIC, TIMER_ABSTIME, &ts, NULL) == EINTR)
-		continue;
-}
-
-/* What another program holds is not ours; the thread of a link just closed may need a moment to let go. */
-static int lock_line(int fd)
-{
-	for (int i = 0; i < 100; i++) {
-		if (flock(fd, LOCK_EX | LOCK_NB) == 0)
-			return 0;
-		sleep_until(monotonic_ns() + 10000000);
-	}
-	return -EBUSY;
-}
-
-/* A descriptor beyond FD_SETSIZE would be written outside the set that libmodbus gives to select(). */
-static int claim(struct bus *bus)
-{
-	int fd = modbus_get_socket(bus->modbus);
-	int r;
-
-	if (fd < 0 || fd >= FD_SETSIZE)
-		return -EMFILE;
-	fcntl(fd, F_SETFD, FD_CLOEXEC);
-	if (!bus->serial)
-		return 0;
-	r = lock_line(fd);
-	if (!r)
-		modbus_flush(bus->modbus); /* bytes from before are nobody's answer */
-	return r;
-}
-
-static int bus_connect(struct bus *bus)
-{
-	const struct config_device *d = &bus->device;
-	uint32_t baud = d->baud ? d->baud : BAUD_DEFAULT;
-	char host[CONFIG_TEXT_MAX], port[8];
-
-	if (bus->serial)
-		bus->modbus = modbus_new_rtu(d->connect, (int)baud, d->parity ? d->parity : 'N', 8, 1);
-	else if (split_address(d->connect, host, port))
-		bus->modbus = modbus_new_tcp_pi(host, port);
-	if (!bus->modbus)
-		return -errno_of_modbus();
-	bus->silence_ns = bus->serial ? INT64_C(35000000000) / baud : 0;
-	if (bus->serial && bus->silence_ns < SILENCE_MIN_NS)
-		bus->silence_ns = SILENCE_MIN_NS;
-	modbus_set_slave(bus->modbus, d->slave);
-	modbus_set_response_timeout(bus->modbus, CONNECT_S, 0);
-	if (modbus_connect(bus->modbus) < 0)
-		return -errno_of_modbus();
-	modbus_set_response_timeout(bus->modbus, 0, RESPONSE_US);
-	modbus_set_byte_timeout(bus->modbus, 0, BYTE_US);
-	return claim(bus);
-}
-
-static void bus_disconnect(struct bus *bus)
-{
-	if (!bus->modbus)
-		return;
-	modbus_close(bus->modbus);
-	modbus_free(bus->modbus);
-	bus->modbus = NULL;
-}
-
-/* Reads away what still comes, until the line was silent for a response time; at most four of them. */
-static void drain(struct bus *bus)
-{
-	struct pollfd p = {.fd = modbus_get_socket(bus->modbus), .events = POLLIN};
-	uint8_t waste[256];
-	int64_t end_ns = monotonic_ns() + INT64_C(4) * RESPONSE_US * 1000;
-
-	while (monotonic_ns() < end_ns && poll(&p, 1, RESPONSE_US / 1000) > 0)
-		if (read(p.fd, waste, sizeof waste) <= 0)
-			break;
-	modbus_flush(bus->modbus);
-}
-
-static int request(struct bus *bus, struct modbus_transaction *t)
-{
-	int n = t->n, address = t->address;
-	int r;
-
-	switch (t->function) {
-	case 3:
-		r = modbus_read_registers(bus->modbus, address, n, t->value);
-		break;
-	case 4:
-		r = modbus_read_input_registers(bus->modbus, address, n, t->value);
-		break;
-	case 6:
-		r = modbus_write_register(bus->modbus, address, t->value[0]);
-		break;
-	default:
-		r = modbus_write_registers(bus->modbus, address, n, t->value);
-		break;
-	}
-	return r < 0 ? -errno : 0;
-}
-
-static void refuse(struct modbus_transaction *t, int code)
-{
-	t->function |= MODBUS_WIRE_REFUSED;
-	t->n = 1;
-	t->value[0] = (uint16_t)code;
-}
-
-/* 0: go on; -errno: the bus is lost. The transaction says what became of it. */
-static int judge(struct bus *bus, int error, struct modbus_transaction *t)
-{
-	int code = error - MODBUS_ENOBASE;
-
-	if (!error) {
-		bus->failures = 0;
-		return 0;
-	}
-	if (code >= MODBUS_EXCEPTION_ILLEGAL_FUNCTION && code < MODBUS_EXCEPTION_MAX) {
-		bus->failures = 0;
-		refuse(t, code);
-		return 0;
-	}
-	refuse(t, 0);
-	if (error != ETIMEDOUT && error < MODBUS_ENOBASE)
-		return -error;
-	if (!bus->serial || ++bus->failures >= FAILURES_MAX)
-		return error == ETIMEDOUT ? -ETIMEDOUT : -EPROTO;
-	drain(bus);
-	return 0;
-}
+/* ---- the thread ---- */
 
 /* A loop that reads no more (or is gone) loses records; it notices the end of the bus by the closed socket. */
-static void send_record(struct bus *bus, const struct modbus_transaction *t)
+static void send_record(const struct member *m, const struct modbus_transaction *t)
 {
 	uint8_t bytes[MODBUS_WIRE_MAX];
 
-	(void)!send(bus->fd, bytes, modbus_wire_put(t, bytes), MSG_DONTWAIT | MSG_NOSIGNAL);
+	(void)!send(m->fd, bytes, modbus_wire_put(t, bytes), MSG_DONTWAIT | MSG_NOSIGNAL);
 }
 
-static int transact(struct bus *bus, struct modbus_transaction *t)
+/* Says that it is lost, `error` < 0, or just lets go of it. */
+static void dismiss(struct member *m, int32_t error)
 {
-	int r;
+	if (m->gone)
+		return;
+	if (error)
+		(void)!send(m->fd, &error, sizeof error, MSG_DONTWAIT | MSG_NOSIGNAL);
+	close(m->fd);
+	m->gone = true;
+}
 
-	sleep_until(bus->free_ns);
-	t->unit = (uint8_t)bus->device.slave;
-	t->t_request_ns = monotonic_ns();
-	r = request(bus, t);
-	t->t_answer_ns = monotonic_ns();
-	r = judge(bus, -r, t);
-	bus->free_ns = monotonic_ns() + bus->silence_ns;
-	send_record(bus, t);
+static int timeout_us(const struct bus *bus, const struct member *m)
+{
+	if (bus->members == 1)
+		return RESPONSE_US;
+	return m->answered ? SHARED_US : PROBE_US;
+}
+
+/* Nothing, or no valid answer, came. Who is alone is the bus. 0: the bus goes on. */
+static int failed(struct bus *bus, struct member *m, int error)
+{
+	const bool alone = bus->members == 1, out = ++m->failures >= FAILURES_MAX || (!alone && !m->answered);
+	int r = 0;
+
+	if (alone && (!bus->line.serial || out))
+		return error;
+	if (!bus->line.serial) {
+		modbus_line_close(&bus->line);
+		r = modbus_line_open(&bus->line, &m->device);
+	} else if (alone || error == -EPROTO) {
+		modbus_line_drain(&bus->line, alone ? RESPONSE_US : SHARED_US);
+	}
+	m->quiet_ns = alone ? 0 : modbus_line_now() + INT64_C(1000) * RESPONSE_US;
+	if (out)
+		dismiss(m, error);
 	return r;
 }
 
-/* One wish of the loop, to write or to read: 0; -ECONNRESET: the loop closed its end; -errno: the bus is lost. */
-static int serve_wish(struct bus *bus)
+/* 0: go on; -errno: the bus is lost. */
+static int transact(struct bus *bus, struct member *m, struct modbus_transaction *t)
+{
+	int r;
+
+	t->unit = (uint8_t)m->device.slave;
+	r = modbus_line_ask(&bus->line, timeout_us(bus, m), t);
+	send_record(m, t);
+	if (r == -ETIMEDOUT || r == -EPROTO)
+		return failed(bus, m, r);
+	if (!r) {
+		m->failures = 0;
+		m->answered = true;
+	}
+	return r;
+}
+
+/* One wish of the loop, to write or to read. 0, or -errno: the bus is lost. */
+static int serve_wish(struct bus *bus, struct member *m)
 {
 	uint8_t bytes[MODBUS_WIRE_MAX];
 	struct modbus_transaction t;
-	ssize_t n = recv(bus->fd, bytes, sizeof bytes, MSG_DONTWAIT);
+	ssize_t n = recv(m->fd, bytes, sizeof bytes, MSG_DONTWAIT);
 
-	if (n < 0)
-		return errno == EAGAIN || errno == EINTR ? 0 : -errno;
-	if (n == 0)
-		return -ECONNRESET;
-	if (modbus_wire_get(bytes, (size_t)n, &t) <= 0 || t.function & MODBUS_WIRE_REFUSED ||
-	    t.n > MODBUS_MAX_WRITE_REGISTERS)
+	if (n == 0 || (n < 0 && errno != EAGAIN && errno != EINTR))
+		dismiss(m, 0); /* the loop closed its end */
+	if (n <= 0)
 		return 0;
-	return transact(bus, &t);
+	if (modbus_wire_get(bytes, (size_t)n, &t) <= 0 || t.function & MODBUS_WIRE_REFUSED || t.n > WRITE_MAX)
+		return 0;
+	return transact(bus, m, &t);
 }
 
-static int poll_position(struct bus *bus)
+/* A poll that is late is not made up for: the queue never builds up. */
+static int poll_position(struct bus *bus, struct member *m)
 {
-	const struct config_register *position = &bus->device.position;
+	const struct config_register *position = &m->device.position;
 	struct modbus_transaction t = {.function = modbus_wire_read_function(position),
-	                               .address = modbus_wire_address(&bus->device, position->address),
+	                               .address = modbus_wire_address(&m->device, position->address),
 	                               .n = (uint16_t)modbus_wire_registers(position)};
+	int64_t period_ns = m->device.period_ns > MODBUS_PERIOD_MIN_NS ? m->device.period_ns : MODBUS_PERIOD_MIN_NS;
+	int r = transact(bus, m, &t);
 
-	return transact(bus, &t);
+	m->poll_ns += period_ns;
+	if (m->poll_ns < modbus_line_now())
+		m->poll_ns = modbus_line_now();
+	return r;
 }
 
-/* Until the bus is lost or the loop has gone. A poll that is late is not made up for: the queue never builds up. */
+static void take_joiners(struct bus *bus)
+{
+	uint64_t count;
+
+	(void)!read(bus->wake, &count, sizeof count);
+	pthread_mutex_lock(&lock);
+	for (int i = 0; i < bus->joiners; i++)
+		bus->joiner[i].poll_ns = modbus_line_now();
+	while (bus->joiners > 0 && bus->members < CONFIG_DEVICES_MAX)
+		bus->member[bus->members++] = bus->joiner[--bus->joiners];
+	pthread_mutex_unlock(&lock);
+}
+
+static void forget_gone(struct bus *bus)
+{
+	int kept = 0;
+
+	for (int i = 0; i < bus->members; i++)
+		if (!bus->member[i].gone)
+			bus->member[kept++] = bus->member[i];
+	bus->members = kept;
+}
+
+/* Until somebody has a wish, joins, leaves, or is to be polled. */
+static void await_work(struct bus *bus)
+{
+	struct pollfd p[CONFIG_DEVICES_MAX + 1] = {{.fd = bus->wake, .events = POLLIN}};
+	int64_t now_ns = modbus_line_now(), next_ns = INT64_MAX, wait_ns;
+	struct timespec ts;
+
+	for (int i = 0; i < bus->members; i++) {
+		const struct member *m = &bus->member[i];
+		int64_t due_ns = m->poll_ns > m->quiet_ns ? m->poll_ns : m->quiet_ns;
+
+		next_ns = due_ns < next_ns ? due_ns : next_ns;
+		p[i + 1] = (struct pollfd){.fd = m->fd, .events = m->quiet_ns > now_ns ? 0 : POLLIN};
+	}
+	wait_ns = next_ns > now_ns ? next_ns - now_ns : 0;
+	ts = (struct timespec){.tv_sec = wait_ns / 1000000000, .tv_nsec = wait_ns % 1000000000};
+	ppoll(p, (nfds_t)bus->members + 1, &ts, NULL);
+	for (int i = 0; i < bus->members; i++)
+		bus->member[i].ready = p[i + 1].revents & POLLIN && p[i + 1].events;
+	for (int i = 0; i < bus->members; i++)
+		bus->member[i].hung = p[i + 1].revents & (POLLHUP | POLLERR);
+}
+
+static int serve_member(struct bus *bus, struct member *m)
+{
+	int r = 0;
+
+	if (m->ready)
+		r = serve_wish(bus, m);
+	else if (m->hung)
+		dismiss(m, 0);
+	if (!r && !m->gone && m->poll_ns <= modbus_line_now() && m->quiet_ns <= modbus_line_now())
+		r = poll_position(bus, m);
+	return r;
+}
+
+/* Nobody uses it and nobody can join any more. */
+static bool is_left(struct bus *bus)
+{
+	bool left;
+
+	pthread_mutex_lock(&lock);
+	left = bus->members == 0 && bus->joiners == 0;
+	for (int i = 0; left && i < CONFIG_DEVICES_MAX; i++)
+		if (buses[i] == bus)
+			buses[i] = NULL;
+	pthread_mutex_unlock(&lock);
+	return left;
+}
+
+/* Until the bus is lost (-errno) or left (0). */
 static int bus_run(struct bus *bus)
 {
-	int64_t period_ns = bus->device.period_ns > MODBUS_PERIOD_MIN_NS ? bus->device.period_ns : MODBUS_PERIOD_MIN_NS;
-	int64_t next_ns = monotonic_ns();
-
 	for (;;) {
-		struct pollfd p = {.fd = bus->fd, .events = POLLIN};
-		int64_t wait_ns = next_ns - monotonic_ns();
-		struct timespec ts = {.tv_sec = wait_ns / 1000000000, .tv_nsec = wait_ns % 1000000000};
-		int r = 0;
+		take_joiners(bus);
+		forget_gone(bus);
+		if (is_left(bus))
+			return 0;
+		await_work(bus);
+		bus->turn++;
+		for (int i = 0; i < bus->members; i++) {
+			int r = serve_member(bus, &bus->member[(bus->turn + i) % bus->members]);
 
-		if (wait_ns > 0)
-			ppoll(&p, 1, &ts, NULL);
-		else
-			poll(&p, 1, 0);
-		if (p.revents)
-			r = serve_wish(bus);
-		if (!r && monotonic_ns() >= next_ns) {
-			r = poll_position(bus);
-			next_ns += period_ns;
-			if (next_ns < monotonic_ns())
-				next_ns = monotonic_ns();
+			if (r)
+				return r;
 		}
-		if (r)
-			return r;
 	}
+}
+
+/* The line is closed: nobody joins any more, and all hear why. */
+static void bus_end(struct bus *bus, int error)
+{
+	pthread_mutex_lock(&lock);
+	for (int i = 0; i < CONFIG_DEVICES_MAX; i++)
+		if (buses[i] == bus)
+			buses[i] = NULL;
+	pthread_mutex_unlock(&lock);
+	for (int i = 0; i < bus->members; i++)
+		dismiss(&bus->member[i], error);
+	for (int i = 0; i < bus->joiners; i++)
+		dismiss(&bus->joiner[i], error);
+	close(bus->wake);
+	free(bus);
 }
 
 static void *bus_thread(void *arg)
 {
 	struct bus *bus = arg;
-	int32_t lost = bus_connect(bus);
+	int lost;
 
+	lost = modbus_line_open(&bus->line, &bus->joiner[0].device); /* the first one stays where it is */
+	pthread_mutex_lock(&lock);
+	bus->opening = false;
+	pthread_mutex_unlock(&lock);
 	if (!lost)
 		lost = bus_run(bus);
-	bus_disconnect(bus);
-	(void)!send(bus->fd, &lost, sizeof lost, MSG_DONTWAIT | MSG_NOSIGNAL);
-	close(bus->fd);
-	crowd_leave(bus->crowd);
-	free(bus);
+	modbus_line_close(&bus->line);
+	bus_end(bus, lost);
 	return NULL;
 }
+
+/* ---- the loop's end ---- */
 
 /* Signals are the loop's. */
 static int start_thread(struct bus *bus)
@@ -379,12 +316,91 @@ static int start_thread(struct bus *bus)
 	return -r;
 }
 
+/* A bus of its own, in its place. Under the lock. */
+static int begin_bus(struct bus **place, const struct member *m)
+{
+	struct bus *bus = calloc(1, sizeof *bus);
+	int r = -ENOMEM;
+
+	if (!bus)
+		return r;
+	bus->wake = eventfd(0, EFD_CLOEXEC | EFD_NONBLOCK);
+	if (bus->wake < 0) {
+		r = -errno;
+		free(bus);
+		return r;
+	}
+	snprintf(bus->connect, sizeof bus->connect, "%s", m->device.connect);
+	bus->joiner[bus->joiners++] = *m;
+	bus->number = ++buses_begun;
+	bus->opening = true;
+	bus->since_ns = modbus_line_now();
+	r = start_thread(bus);
+	if (r) {
+		close(bus->wake);
+		free(bus);
+		return r;
+	}
+	*place = bus;
+	return 0;
+}
+
+/* While the line opens its thread takes nobody: whoever closed and comes again takes the place that he had. */
+static int join_bus(struct bus *bus, const struct member *m)
+{
+	const uint64_t one = 1;
+
+	if (bus->opening && modbus_line_now() - bus->since_ns > PATIENCE_NS)
+		return -EALREADY;
+	for (int i = 0; i < bus->joiners; i++)
+		if (bus->joiner[i].device.slave == m->device.slave) {
+			close(bus->joiner[i].fd);
+			bus->joiner[i].fd = m->fd;
+			return 0;
+		}
+	if (bus->joiners == CONFIG_DEVICES_MAX)
+		return -EUSERS;
+	bus->joiner[bus->joiners++] = *m;
+	(void)!write(bus->wake, &one, sizeof one);
+	return 0;
+}
+
+/* 0 with the number of the bus, or -errno. */
+static int enter_bus(const struct member *m, uint64_t *ret_number)
+{
+	struct bus **place = NULL;
+	int r = -EUSERS;
+
+	pthread_mutex_lock(&lock);
+	for (int i = 0; i < CONFIG_DEVICES_MAX; i++)
+		if (buses[i] ? !strcmp(buses[i]->connect, m->device.connect) : !place)
+			place = &buses[i];
+	if (place)
+		r = *place ? join_bus(*place, m) : begin_bus(place, m);
+	if (!r) {
+		(*place)->links++;
+		*ret_number = (*place)->number;
+	}
+	pthread_mutex_unlock(&lock);
+	return r;
+}
+
+/* Whoever comes after the last one has closed its link begins anew; but no second thread for a line that still opens. */
+static void leave_bus(uint64_t number)
+{
+	pthread_mutex_lock(&lock);
+	for (int i = 0; i < CONFIG_DEVICES_MAX; i++)
+		if (buses[i] && buses[i]->number == number && --buses[i]->links == 0 && !buses[i]->opening)
+			buses[i] = NULL;
+	pthread_mutex_unlock(&lock);
+}
+
 static bool address_is_good(const struct config_device *device, char error[160])
 {
 	char host[CONFIG_TEXT_MAX], port[8];
 
-	if (!is_serial(device->connect)) {
-		if (split_address(device->connect, host, port))
+	if (!modbus_line_is_serial(device->connect)) {
+		if (modbus_line_split(device->connect, host, port))
 			return true;
 		snprintf(error, 160, "%.80s is neither a path of a serial line nor HOST:PORT", device->connect);
 		return false;
@@ -403,12 +419,11 @@ static bool address_is_good(const struct config_device *device, char error[160])
 struct link *modbus_bus_open(const struct config_device *device, char error[160])
 {
 	struct link *link = calloc(1, sizeof *link);
-	struct bus *bus = calloc(1, sizeof *bus);
+	struct member *m = calloc(1, sizeof *m);
 	int pair[2], r = -ENOMEM;
 
-	if (!link || !bus)
+	if (!link || !m)
 		goto fail;
-	r = 0;
 	if (!address_is_good(device, error))
 		goto fail_said;
 	if (socketpair(AF_UNIX, SOCK_SEQPACKET | SOCK_CLOEXEC, 0, pair) < 0) {
@@ -418,29 +433,25 @@ struct link *modbus_bus_open(const struct config_device *device, char error[160]
 	link->fd = pair[0];
 	snprintf(link->connect, sizeof link->connect, "%s", device->connect);
 	link->unit = device->slave;
-	bus->fd = pair[1];
-	bus->device = *device;
-	bus->serial = is_serial(device->connect);
-	bus->crowd = crowd_join(device->name);
-	if (bus->crowd < 0) {
-		snprintf(
-		    error, 160,
-		    "%.50s: %d earlier tries have not ended; does the name server answer? A numeric address needs none",
-		    device->connect, MODBUS_THREADS_MAX);
-		close(pair[0]);
-		close(pair[1]);
-		goto fail_said;
-	}
-	r = start_thread(bus);
+	m->fd = pair[1];
+	m->device = *device;
+	r = enter_bus(m, &link->bus);
+	free(m);
+	m = NULL;
 	if (!r)
 		return link;
-	crowd_leave(bus->crowd);
 	close(pair[0]);
 	close(pair[1]);
 fail:
-	snprintf(error, 160, "%.80s: %s", device->connect, strerror(-r));
+	if (r == -EALREADY)
+		snprintf(
+		    error, 160,
+		    "%.50s: an earlier try has not ended; does the name server answer? A numeric address needs none",
+		    device->connect);
+	else
+		snprintf(error, 160, "%.80s: %s", device->connect, strerror(-r));
 fail_said:
-	free(bus);
+	free(m);
 	free(link);
 	return NULL;
 }
@@ -453,7 +464,7 @@ int modbus_bus_fd(const struct link *link)
 /* From the thread's clock to the loop's. */
 static size_t restamp(struct link *link, uint8_t *bytes, size_t len, int64_t *t_ns)
 {
-	int64_t offset_ns = *t_ns - monotonic_ns();
+	int64_t offset_ns = *t_ns - modbus_line_now();
 	struct modbus_transaction t;
 
 	if (!link->offset_known || offset_ns > link->offset_ns)
@@ -542,7 +553,7 @@ static void tell_tcp(const struct link *link, int error, char ret[160])
 
 void modbus_bus_error(const struct link *link, int error, char ret[160])
 {
-	if (is_serial(link->connect))
+	if (modbus_line_is_serial(link->connect))
 		tell_serial(link, error, ret);
 	else
 		tell_tcp(link, error, ret);
@@ -553,5 +564,6 @@ void modbus_bus_close(struct link *link)
 	if (!link)
 		return;
 	close(link->fd);
+	leave_bus(link->bus);
 	free(link);
 }

@@ -1,6 +1,6 @@
-/* What the files of the Modbus driver share: modbus.c (decoder and table), modbus_bus.c (the thread that waits for
- * libmodbus), modbus_dialogue.c (set-up, faults, watchdog, sweeping), modbus_sequence.c (lists of writes). Nobody else
- * includes it, tests apart. */
+/* What the files of the Modbus driver share: modbus.c (decoder and table), modbus_bus.c (threads that wait for libmodbus),
+ * modbus_line.c (libmodbus), modbus_dialogue.c (set-up, faults, watchdog, sweeping), modbus_sequence.c (lists of writes).
+ * Nobody else includes it, tests apart. */
 #ifndef FACET_DRIVERS_MODBUS_PARTS_H
 #define FACET_DRIVERS_MODBUS_PARTS_H
 
@@ -9,8 +9,6 @@
 
 #define MODBUS_PERIOD_MIN_NS 2000000 /* between polls: nobody needs more than 500 angles a second */
 
-#define MODBUS_THREADS_MAX 4 /* of one device, at the limit it is not opened: see modbus_bus.c */
-
 /* Kinds of `struct reply`. */
 enum modbus_reply {
 	MODBUS_ANGLE,   /* payload: one double, rad, as decoded */
@@ -18,6 +16,25 @@ enum modbus_reply {
 	MODBUS_READ,    /* payload: u16 function, u16 address, u16 value: one register that is not the angle */
 	MODBUS_REFUSED  /* payload: u16 function, u16 address, u16 exception code (0: no valid answer came) */
 };
+
+/* A line or connection, for one thread (modbus_line.c). */
+struct modbus_line {
+	struct _modbus *modbus;
+	bool serial;
+	int64_t silence_ns, free_ns; /* between frames; it may be used from free_ns on */
+};
+int64_t modbus_line_now(void); /* CLOCK_MONOTONIC */
+bool modbus_line_is_serial(const char *connect);
+/* "host:port" or "[v6]:port" in two parts; false where it is neither. */
+bool modbus_line_split(const char *connect, char ret_host[CONFIG_TEXT_MAX], char ret_port[8]);
+int modbus_line_open(struct modbus_line *,
+                     const struct config_device *); /* 0 or -errno: then it is to be closed, too */
+void modbus_line_close(struct modbus_line *);
+/* Asks and stamps, and puts the answer into the transaction, also a refusal. 0; -ETIMEDOUT, -EPROTO: nothing came, or no
+ * valid answer, which is a refusal with code 0; another -errno: the line is lost. */
+int modbus_line_ask(struct modbus_line *, int timeout_us, struct modbus_transaction *);
+/* Reads away what still comes, until the line was silent for so long; at most four times as long. */
+void modbus_line_drain(struct modbus_line *, int silence_us);
 
 /* The link of modbus_bus.c. */
 struct link *modbus_bus_open(const struct config_device *, char error[160]);

@@ -10,19 +10,18 @@
 #include <errno.h>
 #include <fcntl.h>
 #include <math.h>
-#include <modbus.h>
 #include <netdb.h>
 #include <netinet/in.h>
 #include <poll.h>
 #include <pthread.h>
-#include <stdatomic.h>
 #include <stdio.h>
 #include <stdlib.h>
+#include <sys/file.h>
 #include <sys/socket.h>
-#include <termios.h>
 #include <time.h>
 #include <unistd.h>
 
+#include "tests/modbus_peer.h"
 #include "tests/modbus_servo.h"
 
 static int64_t now_ns(void)
@@ -247,18 +246,21 @@ static void a_line_in_use_is_left_alone(void **state)
 	uint8_t buf[MODBUS_WIRE_MAX];
 	char error[160] = "";
 	struct sim_servo *servo = sim_servo_create(&params, error);
-	struct link *first, *second;
+	struct link *link;
 	int64_t t_ns;
+	int other;
 
 	(void)state;
 	strcpy(config.device[0].connect, rtu);
-	first = driver_modbus.link_open(&config.device[0], error);
-	assert_true(await(first, buf, sizeof buf, &t_ns) > 0);
-	second = driver_modbus.link_open(&config.device[0], error);
-	assert_true(until_lost(second) == -EBUSY);
-	assert_true(await(first, buf, sizeof buf, &t_ns) > 0);
-	driver_modbus.link_close(second);
-	driver_modbus.link_close(first);
+	other = open(rtu, O_RDWR | O_NOCTTY); /* another program */
+	assert_int_equal(flock(other, LOCK_EX | LOCK_NB), 0);
+	link = driver_modbus.link_open(&config.device[0], error);
+	assert_true(until_lost(link) == -EBUSY);
+	driver_modbus.link_close(link);
+	close(other);
+	link = driver_modbus.link_open(&config.device[0], error);
+	assert_true(await(link, buf, sizeof buf, &t_ns) > 0);
+	driver_modbus.link_close(link);
 	sim_servo_destroy(servo);
 }
 
@@ -295,7 +297,7 @@ static void await_resolver(int waiting)
 	pthread_mutex_unlock(&resolver_lock);
 }
 
-static void a_resolver_that_hangs_costs_a_bounded_number_of_threads(void **state)
+static void a_resolver_that_hangs_costs_one_thread(void **state)
 {
 	struct sim_servo_params params = {.rtu = rtu, .slave = 1};
 	struct config config = servo_config(), other = servo_config();
@@ -308,26 +310,32 @@ static void a_resolver_that_hangs_costs_a_bounded_number_of_threads(void **state
 	(void)state;
 	strcpy(config.device[0].name, "distant");
 	strcpy(config.device[0].connect, "never.answers:502");
-	for (int i = 0; i < MODBUS_THREADS_MAX; i++) {
+	for (int i = 0; i < 100; i++) {
 		link = driver_modbus.link_open(&config.device[0], error);
 		assert_non_null(link);
 		driver_modbus.link_close(link);
 	}
-	await_resolver(MODBUS_THREADS_MAX);
-	for (int i = 0; i < 100; i++)
-		assert_null(driver_modbus.link_open(&config.device[0], error));
-	assert_non_null(strstr(error, "4 earlier tries"));
+	await_resolver(1);
+	/* After a while it is said. */
+	for (int i = 0; i < 2000 && link; i++, usleep(10000)) {
+		link = driver_modbus.link_open(&config.device[0], error);
+		if (link)
+			driver_modbus.link_close(link);
+	}
+	assert_null(link);
+	assert_non_null(strstr(error, "does the name server answer?"));
 	/* Another device is not concerned. */
 	strcpy(other.device[0].connect, rtu);
 	link = driver_modbus.link_open(&other.device[0], error);
 	assert_non_null(link);
 	assert_true(await(link, buf, sizeof buf, &t_ns) > 0);
 	driver_modbus.link_close(link);
+	await_resolver(1);
 	pthread_mutex_lock(&resolver_lock);
 	resolver_answers = true;
 	pthread_cond_broadcast(&resolver_changed);
 	pthread_mutex_unlock(&resolver_lock);
-	/* They end, and the device can be opened again. */
+	/* It ends, and the device can be opened again. */
 	link = NULL;
 	for (int i = 0; i < 2000 && !link; i++, usleep(10000))
 		link = driver_modbus.link_open(&config.device[0], error);
@@ -337,81 +345,268 @@ static void a_resolver_that_hangs_costs_a_bounded_number_of_threads(void **state
 	sim_servo_destroy(servo);
 }
 
-/* A peer that answers the first request only after its time-out, and each answer carries its number. */
-struct late_peer {
-	int master;
-	modbus_t *modbus;
-	atomic_bool stop;
-};
+/* ---- late answers ---- */
 
-static void *late_peer_thread(void *arg)
+static struct config_device unit_of(const struct peer *peer, int unit)
 {
-	struct late_peer *peer = arg;
-	modbus_mapping_t *map = modbus_mapping_new(0, 0, 4, 4);
-	uint8_t request[MODBUS_RTU_MAX_ADU_LENGTH];
-	int served = 0;
+	struct config_device device = servo_config().device[0];
 
-	while (!peer->stop) {
-		struct pollfd p = {.fd = peer->master, .events = POLLIN};
-
-		if (poll(&p, 1, 20) <= 0)
-			continue;
-		int n = modbus_receive(peer->modbus, request);
-
-		if (n <= 0)
-			continue;
-		map->tab_registers[1] = (uint16_t)served;
-		if (served++ == 0)
-			usleep(700000); /* later than the driver's 500 ms */
-		modbus_reply(peer->modbus, request, n, map);
-	}
-	modbus_mapping_free(map);
-	return NULL;
+	snprintf(device.name, sizeof device.name, "unit%d", unit);
+	strcpy(device.connect, peer->connect);
+	device.slave = unit;
+	device.period_ns = 5 * MS;
+	return device;
 }
 
-static void a_late_answer_is_never_taken_for_the_next_one(void **state)
+/* The next record, and that it is the unit's own. 0, or why the bus was lost. */
+static int next_answer(struct link *link, int unit, struct modbus_transaction *ret)
 {
-	struct config config = servo_config();
-	struct late_peer peer = {.master = posix_openpt(O_RDWR | O_NOCTTY)};
-	struct modbus_transaction t;
-	struct termios raw;
 	uint8_t buf[MODBUS_WIRE_MAX];
-	char error[160] = "", name[64];
-	struct link *link;
-	pthread_t thread;
 	int64_t t_ns;
-	ssize_t len;
-	int slave;
+	ssize_t len = await(link, buf, sizeof buf, &t_ns);
+
+	if (len < 0)
+		return (int)len;
+	assert_int_equal(modbus_wire_get(buf, (size_t)len, ret), len);
+	assert_int_equal(ret->unit, unit);
+	if (ret->function == 3)
+		assert_int_equal(ret->value[0], unit);
+	return 0;
+}
+
+static void a_late_answer_on_a_line_is_never_taken_for_the_next_one(void **state)
+{
+	struct modbus_transaction t;
+	struct config_device device;
+	struct link *link;
+	struct peer peer;
+	char error[160];
 
 	(void)state;
-	assert_int_equal(grantpt(peer.master) | unlockpt(peer.master) | ptsname_r(peer.master, name, sizeof name), 0);
-	slave = open(name, O_RDWR | O_NOCTTY);
-	tcgetattr(slave, &raw);
-	cfmakeraw(&raw);
-	tcsetattr(slave, TCSANOW, &raw);
-	peer.modbus = modbus_new_rtu(name, 115200, 'N', 8, 1);
-	modbus_set_slave(peer.modbus, 1);
-	modbus_set_socket(peer.modbus, peer.master);
-	pthread_create(&thread, NULL, late_peer_thread, &peer);
-	snprintf(config.device[0].connect, sizeof config.device[0].connect, "%s", name);
-	link = driver_modbus.link_open(&config.device[0], error);
-	assert_non_null(link);
-	len = await(link, buf, sizeof buf, &t_ns);
-	assert_int_equal(modbus_wire_get(buf, (size_t)len, &t), len);
+	peer_start(&peer, false);
+	device = unit_of(&peer, 1);
+	peer.late_ms[1] = 700; /* later than the driver's 500 ms */
+	link = driver_modbus.link_open(&device, error);
+	assert_int_equal(next_answer(link, 1, &t), 0);
 	assert_int_equal(t.function, 3 | MODBUS_WIRE_REFUSED);
 	assert_int_equal(t.value[0], 0);
 	for (int i = 1; i < 5; i++) { /* the answer numbered 0 is never seen */
-		len = await(link, buf, sizeof buf, &t_ns);
-		assert_int_equal(modbus_wire_get(buf, (size_t)len, &t), len);
+		assert_int_equal(next_answer(link, 1, &t), 0);
 		assert_int_equal(t.function, 3);
 		assert_int_equal(t.value[1], i);
 	}
 	driver_modbus.link_close(link);
-	peer.stop = true;
-	pthread_join(thread, NULL);
-	modbus_free(peer.modbus);
-	close(slave);
-	close(peer.master);
+	peer_end(&peer);
+}
+
+static void a_late_answer_over_tcp_ends_the_connection(void **state)
+{
+	struct modbus_transaction t;
+	struct config_device device;
+	struct link *link;
+	struct peer peer;
+	char error[160];
+
+	(void)state;
+	peer_start(&peer, true);
+	device = unit_of(&peer, 1);
+	for (int i = 0; i < 3; i++) {
+		const int asked = peer.requests[1];
+
+		peer.late_ms[1] = 700;
+		link = driver_modbus.link_open(&device, error);
+		assert_int_equal(next_answer(link, 1, &t), 0);
+		assert_int_equal(t.function, 3 | MODBUS_WIRE_REFUSED);
+		assert_int_equal(next_answer(link, 1, &t), -ETIMEDOUT);
+		driver_modbus.link_close(link);
+		link = driver_modbus.link_open(&device, error); /* as the supervisor does */
+		for (int k = 1; k < 5; k++) {
+			assert_int_equal(next_answer(link, 1, &t), 0);
+			assert_int_equal(t.function, 3);
+			assert_int_equal(t.value[1], asked + k);
+		}
+		driver_modbus.link_close(link);
+	}
+	assert_int_equal(peer.connections, 6);
+	peer_end(&peer);
+}
+
+/* ---- several devices on one bus ---- */
+
+struct shared {
+	struct peer peer;
+	struct config_device device[3];
+	struct link *link[3]; /* of units 1 and 2 */
+	int answers[3], lost[3];
+	int64_t answered_ns[3], gap_ns[3], lost_ns[3];
+};
+
+static void share_bus(struct shared *s, bool tcp)
+{
+	char error[160];
+
+	memset(s, 0, sizeof *s);
+	peer_start(&s->peer, tcp);
+	for (int unit = 1; unit <= 2; unit++) {
+		s->device[unit] = unit_of(&s->peer, unit);
+		s->link[unit] = driver_modbus.link_open(&s->device[unit], error);
+		assert_non_null(s->link[unit]);
+	}
+}
+
+static void part_bus(struct shared *s)
+{
+	for (int unit = 1; unit <= 2; unit++)
+		driver_modbus.link_close(s->link[unit]); /* NULL, if it was lost just now */
+	peer_end(&s->peer);
+}
+
+static void count_answer(struct shared *s, int unit)
+{
+	struct modbus_transaction t;
+	int r = next_answer(s->link[unit], unit, &t);
+	int64_t t_ns = now_ns();
+
+	if (r < 0) {
+		s->lost[unit]++;
+		s->lost_ns[unit] = t_ns;
+		driver_modbus.link_close(s->link[unit]);
+		s->link[unit] = NULL;
+		return;
+	}
+	if (t.function & MODBUS_WIRE_REFUSED)
+		return;
+	s->answers[unit]++;
+	if (s->answered_ns[unit] && t_ns - s->answered_ns[unit] > s->gap_ns[unit])
+		s->gap_ns[unit] = t_ns - s->answered_ns[unit];
+	s->answered_ns[unit] = t_ns;
+}
+
+/* Reads both until unit 1 has so many more answers; whoever is lost is opened again a second later. */
+static void read_both(struct shared *s, int answers)
+{
+	const int until = s->answers[1] + answers;
+	char error[160];
+
+	while (s->answers[1] < until) {
+		struct pollfd p[3] = {{.fd = -1}, {.fd = -1}, {.fd = -1}};
+
+		for (int unit = 1; unit <= 2; unit++) {
+			if (!s->link[unit] && now_ns() - s->lost_ns[unit] > 1000 * MS)
+				s->link[unit] = driver_modbus.link_open(&s->device[unit], error);
+			if (s->link[unit])
+				p[unit] = (struct pollfd){.fd = driver_modbus.link_fd(s->link[unit]), .events = POLLIN};
+		}
+		assert_true(poll(p, 3, 1000) >= 0);
+		for (int unit = 1; unit <= 2; unit++)
+			if (p[unit].revents)
+				count_answer(s, unit);
+	}
+}
+
+/* A machine that is busy elsewhere may make this test's units late: then it is tried again. */
+static void two_devices_share_a_bus_and_are_polled_alike(void **state)
+{
+	(void)state;
+	for (int tcp = 0; tcp < 2; tcp++) {
+		bool undisturbed = false;
+
+		for (int tries = 0; tries < 20 && !undisturbed; tries++) {
+			struct shared s;
+
+			share_bus(&s, tcp);
+			read_both(&s, 100);
+			undisturbed = s.lost[1] + s.lost[2] == 0;
+			assert_true(!undisturbed || abs(s.answers[2] - 100) < 20);
+			assert_true(!undisturbed || s.peer.connections == tcp);
+			part_bus(&s);
+		}
+		assert_true(undisturbed);
+	}
+}
+
+static void an_absent_device_costs_the_other_a_tenth_of_a_second_each_second(void **state)
+{
+	(void)state;
+	for (int tcp = 0; tcp < 2; tcp++) {
+		struct shared s;
+		int64_t begun_ns;
+
+		share_bus(&s, tcp);
+		s.peer.mute[2] = true;
+		while (s.lost[2] == 0)
+			read_both(&s, 10);
+		s.gap_ns[1] = 0;
+		begun_ns = now_ns();
+		read_both(&s, 400);
+		print_message(
+		    "note: %s, beside a unit that does not answer: %.0f answers/s of 200, longest gap %.0f ms\n",
+		    tcp ? "TCP" : "RTU", 400e9 / (double)(now_ns() - begun_ns), (double)s.gap_ns[1] * 1e-6);
+		assert_int_equal(s.answers[2], 0);
+		s.peer.mute[2] = false;
+		while (s.answers[2] == 0) /* it is back */
+			read_both(&s, 10);
+		part_bus(&s);
+	}
+}
+
+static void closing_one_device_leaves_the_other(void **state)
+{
+	(void)state;
+	for (int tcp = 0; tcp < 2; tcp++)
+		for (int gone = 1; gone <= 2; gone++) {
+			const int other = 3 - gone;
+			struct shared s;
+			char error[160];
+
+			share_bus(&s, tcp);
+			while (s.answers[2] < 20)
+				read_both(&s, 10);
+			driver_modbus.link_close(s.link[gone]);
+			s.link[gone] = NULL;
+			s.lost_ns[gone] = INT64_MAX; /* not to be opened again */
+			s.answers[gone] = s.answers[other] = 0;
+			while (s.answers[other] < 50) {
+				if (s.link[other])
+					count_answer(&s, other);
+				else
+					s.link[other] = driver_modbus.link_open(&s.device[other], error);
+			}
+			s.lost_ns[gone] = 0;
+			while (s.answers[gone] < 20)
+				read_both(&s, gone == 1 ? 10 : 1);
+			part_bus(&s);
+		}
+}
+
+/* next_answer looks whose value it is. */
+static void a_late_answer_on_a_shared_line_is_nobody_elses(void **state)
+{
+	struct shared s;
+
+	(void)state;
+	share_bus(&s, false);
+	read_both(&s, 20);
+	for (int i = 0; i < 5; i++) {
+		s.peer.late_ms[2] = 300; /* later than the 200 ms of a shared bus */
+		read_both(&s, 50);
+	}
+	part_bus(&s);
+}
+
+static void a_bus_that_is_lost_is_lost_for_all_and_comes_back_for_all(void **state)
+{
+	struct shared s;
+
+	(void)state;
+	share_bus(&s, true);
+	read_both(&s, 20);
+	shutdown(s.peer.fd, SHUT_RDWR);
+	read_both(&s, 200);
+	assert_true(s.lost[1] >= 1 && s.lost[2] >= 1);
+	while (s.answers[2] < 50)
+		read_both(&s, 10);
+	part_bus(&s);
 }
 
 int main(void)
@@ -424,8 +619,14 @@ int main(void)
 	    cmocka_unit_test(a_lost_bus_is_reported_and_can_be_opened_again),
 	    cmocka_unit_test(a_host_that_refuses_costs_the_loop_nothing),
 	    cmocka_unit_test(a_line_in_use_is_left_alone),
-	    cmocka_unit_test(a_resolver_that_hangs_costs_a_bounded_number_of_threads),
-	    cmocka_unit_test(a_late_answer_is_never_taken_for_the_next_one),
+	    cmocka_unit_test(a_resolver_that_hangs_costs_one_thread),
+	    cmocka_unit_test(a_late_answer_on_a_line_is_never_taken_for_the_next_one),
+	    cmocka_unit_test(a_late_answer_over_tcp_ends_the_connection),
+	    cmocka_unit_test(two_devices_share_a_bus_and_are_polled_alike),
+	    cmocka_unit_test(an_absent_device_costs_the_other_a_tenth_of_a_second_each_second),
+	    cmocka_unit_test(closing_one_device_leaves_the_other),
+	    cmocka_unit_test(a_late_answer_on_a_shared_line_is_nobody_elses),
+	    cmocka_unit_test(a_bus_that_is_lost_is_lost_for_all_and_comes_back_for_all),
 	};
 
 	return cmocka_run_group_tests(tests, make_dir, remove_dir);

@@ -841,6 +841,239 @@ static void real_sweeps_have_the_beams_that_are_written_down(void **state)
 	}
 }
 
+/* Poses at 100 Hz along x at 1 m/s from `from_ms`; at `jump_ms` the map is moved by 5 m, and so is what follows. */
+static void feed_jumping_poses(struct sweep *s, int from_ms, int to_ms, int jump_ms)
+{
+	for (int t = from_ms; t <= to_ms; t += 10)
+		sweep_pose(s, &(struct pose){.t_ns = t * MS,
+		                             .position_m = {0.001 * t + (t >= jump_ms ? 5 : 0), 0, 0},
+		                             .rotation = {.w = 1},
+		                             .jumped = t == jump_ms});
+}
+
+static struct sweep *open_moving(void)
+{
+	struct sweep_params params = plain_params();
+
+	params.fixed_pose = false;
+	params.fixed_tilt = true;
+	return sweep_create(&params);
+}
+
+/* A profile takes 6.7 ms. The frame changes at 200 ms. */
+static void nothing_is_interpolated_across_a_jump(void **state)
+{
+	struct sweep *s = open_moving();
+	struct row *row;
+
+	(void)state;
+	feed_jumping_poses(s, 100, 300, 200);
+	/* Before the jump; between the last pose before it and the jump; across it; after it. */
+	static const int begin_ms[] = {170, 192, 197, 203}, frame[] = {0, 0, 0, 1};
+	for (int i = 0; i < 4; i++) {
+		struct profile *p = make_profile(begin_ms[i] * MS, 1, 5);
+		sweep_profile(s, p, 300 * MS);
+		row = expect_row(s, 300 * MS);
+		for (uint32_t k = 0; k < row->n; k++) {
+			const double t_s = 1e-9 * (double)time_of_beam(p, (int)k);
+			assert_true(fabs(row->beam[k].origin.x - t_s - 5 * frame[i]) < 1e-9);
+		}
+		assert_int_equal(row->starts_sweep, i == 0 || i == 3); /* no surface is spanned between the frames */
+		row_destroy(row);
+	}
+	sweep_destroy(s);
+}
+
+static void a_row_too_far_beyond_the_last_pose_of_its_frame_is_dropped(void **state)
+{
+	struct sweep *s = open_moving();
+
+	(void)state;
+	feed_jumping_poses(s, 100, 130, 1000);
+	feed_jumping_poses(s, 200, 300, 200);
+	sweep_profile(s, make_profile(170 * MS, 1, 5), 300 * MS);
+	row_destroy(expect_row(s, 300 * MS)); /* its last beam is 47 ms behind the pose */
+	sweep_profile(s, make_profile(177 * MS, 1, 5), 300 * MS);
+	expect_drop(s, 300 * MS, SWEEP_STALE_POSE);
+	sweep_destroy(s);
+}
+
+/* The twist behind a jump is none until the frame has two poses. */
+static void a_jump_is_no_speed(void **state)
+{
+	struct sweep *s = open_moving();
+	struct row *row;
+
+	(void)state;
+	feed_jumping_poses(s, 100, 200, 200);
+	sweep_profile(s, make_profile(210 * MS, 1, 5), 210 * MS);
+	expect_wait(s, 230 * MS);
+	row = expect_row(s, 240 * MS);
+	assert_true(fabs(row->beam[180].origin.x - 5.2) < 1e-9);
+	row_destroy(row);
+	sweep_destroy(s);
+}
+
+static void what_was_measured_before_a_new_map_is_dropped(void **state)
+{
+	struct sweep *s = open_moving();
+	struct row *row;
+
+	(void)state;
+	feed_jumping_poses(s, 100, 190, 1000);
+	sweep_profile(s, make_profile(185 * MS, 1, 5), 195 * MS); /* its last beam is at 191.7 */
+	sweep_profile(s, make_profile(197 * MS, 1, 5), 205 * MS); /* across the jump */
+	expect_wait(s, 206 * MS);
+	feed_jumping_poses(s, 200, 200, 200);
+	row = expect_row(s, 207 * MS); /* complete with the jump: the old map's last one */
+	row_destroy(row);
+	expect_wait(s, 207 * MS);
+	sweep_new_map(s);
+	feed_jumping_poses(s, 210, 300, 200);
+	expect_drop(s, 210 * MS, SWEEP_BEFORE_JUMP);
+	sweep_profile(s, make_profile(215 * MS, 1, 5), 230 * MS);
+	row = expect_row(s, 230 * MS);
+	assert_true(row->starts_sweep);
+	row_destroy(row);
+	sweep_destroy(s);
+}
+
+/* A silence of the pose is not filled, unless the robot stood. */
+static void a_long_silence_of_the_pose_is_not_interpolated(void **state)
+{
+	(void)state;
+	for (int moves = 0; moves < 2; moves++) {
+		struct sweep *s = open_moving();
+
+		add_pose(s, 100 * MS, 0);
+		add_pose(s, 110 * MS, 0);
+		sweep_profile(s, make_profile(400 * MS, 1, 5), 641 * MS);
+		add_pose(s, 641 * MS, moves ? 0.1 : 0.01); /* 531 ms: 500 and `hold` */
+		if (moves)
+			expect_drop(s, 641 * MS, SWEEP_STALE_POSE);
+		else
+			row_destroy(expect_row(s, 641 * MS));
+		sweep_destroy(s);
+	}
+	struct sweep *s = open_moving();
+	add_pose(s, 110 * MS, 0);
+	sweep_profile(s, make_profile(400 * MS, 1, 5), 639 * MS);
+	add_pose(s, 639 * MS, 0.1);
+	row_destroy(expect_row(s, 639 * MS));
+	sweep_destroy(s);
+}
+
+static void rows_are_dropped_while_the_pose_is_less_certain_than_trusted(void **state)
+{
+	struct sweep_params params = plain_params();
+	struct sweep *s;
+
+	(void)state;
+	params.fixed_pose = false;
+	params.fixed_tilt = true;
+	params.trust_m = 0.1;
+	s = sweep_create(&params);
+	for (int t = 100; t < 400; t += 10) /* sigma 0.05, then 0.2, then 0.1 */
+		sweep_pose(s, &(struct pose){.t_ns = t * MS,
+		                             .rotation = {.w = 1},
+		                             .variance_m2 = t < 200   ? 0.0025
+		                                            : t < 300 ? 0.04
+		                                                      : 0.01});
+	sweep_profile(s, make_profile(150 * MS, 1, 5), 400 * MS);
+	row_destroy(expect_row(s, 400 * MS));
+	sweep_profile(s, make_profile(197 * MS, 1, 5), 400 * MS);
+	expect_drop(s, 400 * MS, SWEEP_UNCERTAIN_POSE);
+	sweep_profile(s, make_profile(250 * MS, 1, 5), 400 * MS);
+	expect_drop(s, 400 * MS, SWEEP_UNCERTAIN_POSE);
+	sweep_profile(s, make_profile(305 * MS, 1, 5), 400 * MS);
+	row_destroy(expect_row(s, 400 * MS));
+	sweep_destroy(s);
+}
+
+/* `profile: step`: 50 ms at each angle, 20 ms to the next one. */
+static double step_at(int t_ms)
+{
+	const int n = t_ms / 70, in = t_ms % 70;
+
+	return 0.01 * (n + (in > 50 ? (in - 50) / 20.0 : 0));
+}
+
+static void a_profile_during_which_the_servo_moved_is_dropped_in_step_mode(void **state)
+{
+	(void)state;
+	for (int step = 0; step < 2; step++) {
+		struct sweep_params params = plain_params();
+		struct sweep_stats stats;
+		struct sweep *s;
+		int rows = 0, dropped = 0;
+
+		params.step = step;
+		s = sweep_create(&params);
+		for (int t = 0, next = 20; t < 2000; t++) {
+			add_tilt(s, t * MS, step_at(t));
+			if (t == next) {
+				struct row *row = NULL;
+				enum sweep_drop drop;
+				enum sweep_verdict verdict;
+				const int begin =
+				    t - 8; /* 6.7 ms of beams, and the servo stood or not from before to after */
+
+				sweep_profile(s, make_profile(begin * MS, 1, 5), t * MS);
+				verdict = sweep_next(s, t * MS, false, &row, &drop);
+				const bool stood = step_at(begin) == step_at(begin + 7);
+				if (step && !stood) {
+					assert_int_equal(verdict, SWEEP_DROPPED);
+					assert_int_equal(drop, SWEEP_MOVED);
+					dropped++;
+				} else {
+					assert_int_equal(verdict, SWEEP_ROW);
+					assert_true(!stood || fabs(row->tilt_rad - step_at(begin)) < 1e-12);
+					row_destroy(row);
+					rows++;
+				}
+				next += 13;
+			}
+		}
+		sweep_stats(s, &stats);
+		assert_int_equal(stats.dropped[SWEEP_MOVED], dropped);
+		assert_int_equal(stats.rows, rows);
+		assert_true(step ? dropped > 40 && rows > 80 : dropped == 0);
+		sweep_destroy(s);
+	}
+}
+
+/* The servo's bus is down for half a second and the servo has stood meanwhile, or gone on a little: rows on both sides are
+ * no neighbours. */
+static void a_tilt_that_was_lost_cuts_the_raster(void **state)
+{
+	(void)state;
+	for (int gap = 0; gap < 2; gap++) {
+		struct sweep_params params = plain_params();
+		struct sweep *s = sweep_create(&params);
+		int starts = 0;
+
+		for (int t = 0; t < 2000; t += 5) {
+			struct row *row = NULL;
+			enum sweep_drop drop;
+
+			if (!gap || t < 800 || t >= 1300)
+				add_tilt(s, t * MS, 0.3 + 1e-5 * t);
+			if (t % 15 == 0 && t > 0)
+				sweep_profile(s, make_profile((t - 8) * MS, 1, 5), t * MS);
+			while (sweep_next(s, t * MS, false, &row, &drop) != SWEEP_WAIT)
+				if (row) {
+					starts += row->starts_sweep;
+					assert_true(!row->starts_sweep || row->t_ns < 100 * MS ||
+					            row->t_ns > 1250 * MS);
+					row_destroy(row);
+					row = NULL;
+				}
+		}
+		assert_int_equal(starts, 1 + gap);
+		sweep_destroy(s);
+	}
+}
+
 int main(void)
 {
 	const struct CMUnitTest tests[] = {
@@ -870,6 +1103,14 @@ int main(void)
 	    cmocka_unit_test(walls_of_a_corridor_are_not_mixed),
 	    cmocka_unit_test(a_beam_that_jumps_to_both_valid_neighbours_is_mixed),
 	    cmocka_unit_test(real_sweeps_have_the_beams_that_are_written_down),
+	    cmocka_unit_test(nothing_is_interpolated_across_a_jump),
+	    cmocka_unit_test(a_row_too_far_beyond_the_last_pose_of_its_frame_is_dropped),
+	    cmocka_unit_test(a_jump_is_no_speed),
+	    cmocka_unit_test(what_was_measured_before_a_new_map_is_dropped),
+	    cmocka_unit_test(a_long_silence_of_the_pose_is_not_interpolated),
+	    cmocka_unit_test(rows_are_dropped_while_the_pose_is_less_certain_than_trusted),
+	    cmocka_unit_test(a_profile_during_which_the_servo_moved_is_dropped_in_step_mode),
+	    cmocka_unit_test(a_tilt_that_was_lost_cuts_the_raster),
 	};
 	return cmocka_run_group_tests(tests, NULL, NULL);
 }

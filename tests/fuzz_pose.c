@@ -29,8 +29,13 @@ static void judge(void *ctx, int device, const struct pose *pose)
 	     fabs(pose->position_m.z) <= POSE_LINE_FAR_M);
 	must(fabs(q->w * q->w + q->x * q->x + q->y * q->y + q->z * q->z - 1.0) < 1e-12);
 	must(llabs(pose->t_ns - T0) <= POSE_LINE_LATE_NS + 1000);
+	must(pose->variance_m2 >= 0 && pose->variance_m2 <= 2.1e12 && pose->variance_rad2 >= 0 && !pose->jumped);
 	must(n > 0);
-	must(pose_line_parse(line, (size_t)n, pose->t_ns, &back) == POSE_LINE_OK);
+	/* The larger axis of two that are just small enough need not be. */
+	must(pose_line_parse(line, (size_t)n, pose->t_ns, &back) == POSE_LINE_OK || pose->variance_m2 > 1e12);
+	if (pose->variance_m2 > 1e12)
+		return;
+	must(back.variance_m2 == pose->variance_m2 && back.variance_rad2 == pose->variance_rad2);
 	must(back.position_m.x == pose->position_m.x && back.position_m.y == pose->position_m.y);
 }
 

@@ -162,7 +162,7 @@ static void assembler_feed(void *module, const uint8_t *data, size_t size)
 		if (kind == 0)
 			sweep_tilt(module, &(struct tilt){t_ns, value * 0.01});
 		else if (kind == 1)
-			sweep_pose(module, &(struct pose){t_ns, {value * 0.02, 0, 0}, {1, 0, 0, 0}});
+			sweep_pose(module, &(struct pose){t_ns, {value * 0.02, 0, 0}, {1, 0, 0, 0}, 0, 0, value == 60});
 		else
 			sweep_profile(module, fuzz_state_profile(&profile, t_ns, value), t_ns);
 		drain(module, t_ns, false);

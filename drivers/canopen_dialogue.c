@@ -472,7 +472,7 @@ static void learn(struct dialogue *d, int64_t t_ns)
 		learn_object(d, 0x1800 + i, 1, 4);
 		learn_object(d, 0x1800 + i, 2, 1);
 		learn_object(d, 0x1a00 + i, 0, 1);
-		for (uint8_t sub = 1; sub <= 4; sub++)
+		for (uint8_t sub = 1; sub <= CANOPEN_PDO_ENTRIES; sub++)
 			learn_object(d, 0x1a00 + i, sub, 4);
 	}
 	canopen_setup_begin(&d->setup);
@@ -523,7 +523,7 @@ static struct found look_at(const struct dialogue *d, int pdo)
 	       (cob & CANOPEN_COB_ID) == CANOPEN_TPDO + 0x100u * (uint32_t)pdo + (uint32_t)d->device.node;
 	f.in_time = has_sync(d) ? type <= CANOPEN_TYPE_SYNC_MAX : type >= CANOPEN_TYPE_EVENT;
 	f.empty = n == 0;
-	for (uint8_t sub = 1; sub <= 4 && sub <= n; sub++)
+	for (uint8_t sub = 1; sub <= CANOPEN_PDO_ENTRIES && sub <= n; sub++)
 		if (canopen_setup_value(&d->setup, index + 0x200, sub, &entry) && is_angle(d, entry))
 			f.holds = true;
 	return f;

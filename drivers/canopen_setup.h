@@ -9,7 +9,7 @@
 
 #include "drivers/canopen_sdo.h"
 
-#define CANOPEN_SETUP_OBJECTS 32
+#define CANOPEN_SETUP_OBJECTS 64
 #define CANOPEN_SETUP_PDOS    8
 #define CANOPEN_PDO_ENTRIES   8 /* of 8 bits at least in 8 bytes */
 

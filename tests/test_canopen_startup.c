@@ -315,6 +315,50 @@ static void a_power_cycle_is_a_first_start(void **state)
 	end(&b);
 }
 
+/* Somebody wrote it before. */
+static void write_object(struct bed *b, uint16_t index, uint8_t sub, uint8_t size, uint32_t value)
+{
+	struct canopen_wire_sdo sdo = {
+	    .kind = CANOPEN_SDO_DOWNLOAD, .index = index, .sub = sub, .expedited = true, .sized = true, .len = size};
+	uint8_t bytes[8], entry[CAN_WIRE_ENTRY_FD];
+	struct can_frame_at f;
+
+	for (int i = 0; i < 4; i++)
+		sdo.data[i] = (uint8_t)(value >> 8 * i);
+	canopen_wire_put_request(&sdo, bytes);
+	f = can_wire_frame(CANOPEN_SDO_REQUEST + NODE, bytes, sizeof bytes);
+	f.t_ns = b->t_ns;
+	b->node.receive(b->node.ctx, entry, can_wire_put(&f, entry), b->t_ns);
+	b->t_ns += 10 * MS;
+	hear(b);
+}
+
+/* The angle behind four small objects, in the last of its PDOs: nothing need be changed. */
+static void a_long_mapping_that_has_the_angle_is_left_alone(void **state)
+{
+	struct bed b;
+
+	(void)state;
+	begin(&b, SIM_CANOPEN_DRIVE, false);
+	b.t_ns += 100 * MS; /* it has booted */
+	hear(&b);
+	write_object(&b, 0x1803, 1, 4, 0x80000480 + NODE);
+	write_object(&b, 0x1803, 2, 1, 1);
+	write_object(&b, 0x1a03, 0, 1, 0);
+	for (uint8_t sub = 1; sub <= 4; sub++)
+		write_object(&b, 0x1a03, sub, 4, 0x60610008);
+	write_object(&b, 0x1a03, 5, 4, 0x60640020);
+	write_object(&b, 0x1a03, 0, 1, 5);
+	write_object(&b, 0x1803, 1, 4, 0x480 + NODE);
+	write_object(&b, 0x1017, 0, 2, 200);
+	start(&b);
+	run_until_streaming(&b);
+	run(&b, 3000);
+	assert_int_equal(b.downloads, 0);
+	assert_angles_are_right(&b, 0.001 * DEG);
+	end(&b);
+}
+
 /* Answers without their last bytes, with an echo, late: the same in the end. */
 static void odd_answers_change_nothing(void **state)
 {
@@ -345,6 +389,7 @@ int main(void)
 	const struct CMUnitTest tests[] = {
 	    cmocka_unit_test(a_wrong_mapping_is_set_right_and_then_left_alone),
 	    cmocka_unit_test(a_power_cycle_is_a_first_start),
+	    cmocka_unit_test(a_long_mapping_that_has_the_angle_is_left_alone),
 	    cmocka_unit_test(odd_answers_change_nothing),
 	};
 

@@ -45,6 +45,7 @@
 #define VELOCITY_EXTRA 1.25         /* ... and no faster than this, times the peak */
 #define ENTRIES        (DIALOGUE_WRITE_MAX / CAN_WIRE_ENTRY)
 #define TPDOS          4
+#define LEDS           16
 
 #define TYPE_EVENT 255 /* what CiA 402 calls its own events */
 
@@ -88,6 +89,11 @@ struct dialogue {
 	uint8_t asked_sub;
 	bool asked_download;
 	int64_t halting_ns;
+	struct led { /* set-points of mode velocity that may still be compared with an angle */
+		int64_t t_ns;
+		double rad;
+	} led[LEDS];
+	unsigned leds;
 	bool speed_sent, target_sent;
 	double sent_rad_s, sent_rad;
 	uint32_t speeds, taken;
@@ -823,6 +829,7 @@ static void begin_sweep(struct dialogue *d, int64_t t_ns)
 		sweeper_limits(&d->sweeper, a < b ? a : b, a < b ? b : a);
 	}
 	d->begun = true;
+	d->leds = 0;
 	d->halting = d->speed_sent = d->target_sent = false;
 	d->speeds = d->drive.speeds;
 	d->taken = d->drive.taken;
@@ -885,6 +892,21 @@ static void sweep(struct dialogue *d, int64_t t_ns, struct dialogue_step *ret)
 		canopen_drive_halt(&d->drive, wish.why, t_ns);
 }
 
+/* How far the newest angle is behind the set-point of its own time. */
+static double behind(const struct dialogue *d)
+{
+	const int64_t t_ns = d->sweeper.angle_ns;
+
+	for (unsigned i = 2; i <= LEDS && i <= d->leds; i++) {
+		const struct led *a = &d->led[(d->leds - i) % LEDS], *b = &d->led[(d->leds - i + 1) % LEDS];
+
+		if (a->t_ns <= t_ns && t_ns < b->t_ns)
+			return a->rad + (b->rad - a->rad) * (double)(t_ns - a->t_ns) / (double)(b->t_ns - a->t_ns) -
+			       d->sweeper.angle_rad;
+	}
+	return 0.0;
+}
+
 /* A set-point, where one is due. */
 static void lead(struct dialogue *d, int64_t t_ns)
 {
@@ -904,7 +926,9 @@ static void lead(struct dialogue *d, int64_t t_ns)
 		return;
 	}
 	if (!d->halting)
-		rad_s += VELOCITY_GAIN * (rad - d->sweeper.angle_rad);
+		rad_s += VELOCITY_GAIN * behind(d);
+	d->led[d->leds++ % LEDS].t_ns = t_ns + period_ns(d);
+	d->led[(d->leds - 1) % LEDS].rad = rad;
 	rad_s = rad_s > peak ? peak : rad_s < -peak ? -peak : rad_s;
 	canopen_drive_follow(&d->drive, (int32_t)rint(d->device.count.sign * rad_s / d->device.count.scale));
 }

@@ -221,9 +221,24 @@ static void on_data(void *ctx, int device, int64_t t_ns)
 	((struct outcome *)ctx)->datas++;
 }
 
+/* As the daemon does it. */
+static void on_jump(void *ctx, int device, const struct pose_jump *jump)
+{
+	struct outcome *o = ctx;
+
+	assert_int_equal(device, POSE);
+	buffer_printf(&o->text, "jump %s%.3f\n", jump->back ? "back " : "", jump->distance_m);
+	if (jump->done != POSE_TRACK_NEW_MAP)
+		return;
+	pipeline_reset(o->pipeline);
+	o->split = o->text.len;
+	if (o->journal.begin)
+		assert_int_equal(journal_begin(&o->journal, o->pipeline), 0);
+}
+
 static void open_outcome(struct outcome *o)
 {
-	struct pipeline_sink sink = {o, on_row, on_not_applied, on_flush, on_reply, on_data, NULL};
+	struct pipeline_sink sink = {o, on_row, on_not_applied, on_flush, on_reply, on_data, on_jump};
 
 	memset(o, 0, sizeof(*o));
 	o->pipeline = pipeline_create(&config, &sink);
@@ -780,6 +795,108 @@ static void a_damaged_list_is_refused_with_a_sentence(void **state)
 	close_outcome(&live);
 }
 
+/* A drive at 77 Hz and 0.77 m/s whose map is moved by 3 m with pose `at`, as `play`. */
+static void play_jump(struct outcome *o, int64_t t_ns, int n, int at)
+{
+	for (int i = 0; i < n; i++, t_ns += 13 * MS) {
+		give(o, POSE, 'P', t_ns, t_ns, 0.01 * i + (i >= at ? 3 : 0));
+		give(o, TILT_A, 'T', t_ns, t_ns, 0.001 * i);
+		give(o, LASER_A, 'L', t_ns + 3 * MS, t_ns + 12 * MS, 2 + 0.1 * i); /* across the next pose */
+	}
+}
+
+static void order_jumps(int on_jump)
+{
+	config.device[POSE].jump_m = 0.3;
+	config.device[POSE].jump_rad = 0.1;
+	config.device[POSE].on_jump = on_jump;
+}
+
+static void a_jump_is_told_once_and_done_as_ordered(void **state)
+{
+	static const int modes[] = {JUMP_KEEP, JUMP_IGNORE, JUMP_NEW_MAP};
+	struct pose_track_status status;
+	struct outcome o;
+
+	(void)state;
+	for (int m = 0; m < 3; m++) {
+		order_jumps(modes[m]);
+		open_outcome(&o);
+		play_jump(&o, 1000 * MS, 40, 20);
+		terminate(&o);
+		assert_int_equal(count(&o, "jump 3.0"), 1);
+		assert_int_equal(count(&o, "jump"), 1);
+		/* Where the raster is cut, and whether numbers begin anew. */
+		assert_int_equal(count(&o, " starts"), modes[m] == JUMP_IGNORE ? 1 : 2);
+		assert_int_equal(count(&o, "row 1 "), modes[m] == JUMP_NEW_MAP ? 2 : 1);
+		assert_int_equal(count(&o, "flush"), modes[m] == JUMP_NEW_MAP);
+		pipeline_track(o.pipeline, POSE, &status);
+		assert_int_equal(status.jumps, 1);
+		pipeline_track(o.pipeline, LASER_A, &status);
+		assert_false(status.known);
+		close_outcome(&o);
+	}
+}
+
+/* The row that was measured across the jump belongs to neither map, and has a number in the new one. */
+static void rows_of_the_old_map_end_with_the_record_that_jumped(void **state)
+{
+	struct pipeline_stats stats;
+	struct outcome o;
+	const char *old, *new;
+
+	(void)state;
+	order_jumps(JUMP_NEW_MAP);
+	open_outcome(&o);
+	play_jump(&o, 1000 * MS, 40, 20);
+	terminate(&o);
+	old = strstr((char *)o.text.data, "row 18 raster 0 t 1246000000"); /* complete with the pose that jumped */
+	new = strstr((char *)o.text.data, "jump 3.0");
+	assert_non_null(old);
+	assert_true(old < new);
+	pipeline_stats(o.pipeline, &stats);
+	assert_int_equal(stats.sweep.dropped[SWEEP_BEFORE_JUMP], 1);
+	assert_null(strstr(new, "row 0 raster")); /* the number of the row that was dropped */
+	assert_non_null(strstr(new, "row 1 raster 0 starts t 1272000000"));
+	close_outcome(&o);
+}
+
+static void a_map_that_ended_by_a_jump_is_replayed_from_its_own_list(void **state)
+{
+	char path[64], second[70], error[160] = "";
+	struct journal *journal;
+	struct outcome live, again;
+
+	(void)state;
+	for (int last = 0; last < 2; last++) {
+		order_jumps(JUMP_NEW_MAP);
+		make_path(path);
+		second_list(path, second);
+		journal = journal_create(path, error);
+		assert_non_null(journal);
+		open_outcome(&live);
+		journal_sink(journal, &live.journal);
+		assert_int_equal(journal_begin(&live.journal, live.pipeline), 0);
+		live.refuse_from = 5;
+		live.refuse_to = 8;
+		play_jump(&live, 1000 * MS, 40, 20);
+		journal_destroy(journal);
+		terminate(&live);
+		open_outcome(&again);
+		assert_int_equal(journal_feed(last ? second : path, again.pipeline, error), 0);
+		terminate(&again);
+		if (last)
+			assert_string_equal((char *)again.text.data, (char *)live.text.data + live.split);
+		else
+			assert_memory_equal(again.text.data, live.text.data, live.split);
+		assert_int_equal(again.text.len, last ? live.text.len - live.split : live.split);
+		close_outcome(&again);
+		close_outcome(&live);
+		unlink(path);
+		unlink(second);
+	}
+}
+
 static void a_journal_that_cannot_be_written_says_so(void **state)
 {
 	char error[160] = "";
@@ -806,6 +923,9 @@ int main(void)
 	    cmocka_unit_test(a_step_of_the_wall_clock_changes_no_row_live_or_kept),
 	    cmocka_unit_test(a_list_cut_anywhere_is_fed_up_to_its_last_whole_entry),
 	    cmocka_unit_test(a_damaged_list_is_refused_with_a_sentence),
+	    cmocka_unit_test_setup(a_jump_is_told_once_and_done_as_ordered, set_up),
+	    cmocka_unit_test_setup(rows_of_the_old_map_end_with_the_record_that_jumped, set_up),
+	    cmocka_unit_test_setup(a_map_that_ended_by_a_jump_is_replayed_from_its_own_list, set_up),
 	    cmocka_unit_test(a_journal_that_cannot_be_written_says_so),
 	};
 

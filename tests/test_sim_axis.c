@@ -127,6 +127,19 @@ static void without_acceleration_speeds_change_at_once(void **state)
 	assert_true(fabs(sim_axis_angle(&axis, 9 * SECOND) - 10 * DEG) < 1e-12);
 }
 
+static void what_never_ends_does_not_overflow_the_clock(void **state)
+{
+	int64_t now_ns = INT64_C(1800000000) * SECOND; /* as a wall clock says it */
+
+	(void)state;
+	sim_axis_init(&axis, 0.0, now_ns);
+	sim_axis_goto(&axis, 1e6, 1e-9, 1e-3, now_ns);
+	assert_int_equal(sim_axis_arrival_ns(&axis), INT64_MAX);
+	assert_true(fabs(sim_axis_angle(&axis, now_ns + 1000 * SECOND) - 1e-6) < 1e-9);
+	sim_axis_stop(&axis, 1.0, now_ns + 1000 * SECOND);
+	assert_true(sim_axis_arrived(&axis, now_ns + 1001 * SECOND));
+}
+
 static void its_past_stays_as_it_was(void **state)
 {
 	static double was[4000];
@@ -253,6 +266,7 @@ int main(void)
 	    cmocka_unit_test(it_rests_exactly_where_it_was_sent_and_as_late_as_the_trapezoid_says),
 	    cmocka_unit_test(a_target_behind_it_is_reached_by_turning_and_one_too_near_by_coming_back),
 	    cmocka_unit_test(without_acceleration_speeds_change_at_once),
+	    cmocka_unit_test(what_never_ends_does_not_overflow_the_clock),
 	    cmocka_unit_test(its_past_stays_as_it_was),
 	    cmocka_unit_test(more_motion_than_it_remembers_is_answered_by_the_oldest),
 	    cmocka_unit_test(cyclic_set_points_are_followed_a_cycle_behind),

@@ -447,6 +447,33 @@ static void halves_read_apart_tear_and_when_ordered_in_one_request_too(void **st
 	assert_int_equal(get32(SIM_DRIVE_POSITION), -10);
 }
 
+static void whatever_is_asked_it_lives(void **state)
+{
+	static const uint8_t functions[] = {3, 4, 6, 16, 16, 6, 0, 23};
+	struct modbus_transaction request;
+	struct sim_drive_answer answer;
+	uint64_t random = 9;
+
+	(void)state;
+	for (int strict = 0; strict < 2; strict++) {
+		begin((struct sim_drive_params){.strict = strict, .unhomed = strict, .acceleration = 100 * DEG});
+		for (int i = 0; i < 100000; i++) {
+			request.unit = UNIT;
+			request.function = functions[(int)(sim_random(&random) * 8)];
+			request.address = (uint16_t)(sim_random(&random) * 40);
+			request.n = (uint16_t)(sim_random(&random) < 0.9 ? 1 + sim_random(&random) * 4
+			                                                 : sim_random(&random) * 65536);
+			for (int k = 0; k < MODBUS_WIRE_VALUES_MAX; k++)
+				request.value[k] = (uint16_t)(sim_random(&random) * 65536);
+			sim_drive_transact(drive, &request, t_ns, &answer);
+			assert_in_range(answer.verdict, SIM_DRIVE_ANSWERED, SIM_DRIVE_DROPPED);
+			assert_in_range(answer.transaction.n, 1, MODBUS_WIRE_VALUES_MAX);
+			assert_true(isfinite(degrees()));
+			run((int64_t)(sim_random(&random) * 20e6));
+		}
+	}
+}
+
 static int64_t now_ns(void)
 {
 	struct timespec ts;
@@ -518,6 +545,7 @@ int main(void)
 	    cmocka_unit_test(a_fault_stops_it_and_is_left_by_the_edge_of_reset),
 	    cmocka_unit_test(answers_are_lost_late_wrong_and_refused_when_that_was_ordered),
 	    cmocka_unit_test(halves_read_apart_tear_and_when_ordered_in_one_request_too),
+	    cmocka_unit_test(whatever_is_asked_it_lives),
 	    cmocka_unit_test(behind_a_line_its_faults_are_what_a_master_sees),
 	};
 

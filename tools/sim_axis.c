@@ -27,9 +27,10 @@ static double seconds(int64_t ns)
 	return (double)ns * 1e-9;
 }
 
+/* What takes longer than a clock of our days can say never ends. */
 static int64_t after(int64_t t_ns, double s)
 {
-	return s < 9e9 ? t_ns + (int64_t)rint(s * 1e9) : INT64_MAX;
+	return s < 1e9 ? t_ns + (int64_t)rint(s * 1e9) : INT64_MAX;
 }
 
 /* Up to the other end, in the time since it was at its begin. */

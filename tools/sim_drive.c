@@ -388,6 +388,8 @@ void sim_drive_transact(struct sim_drive *d, const struct modbus_transaction *re
 	    sim_fault_due(&d->fault[SILENCE]))
 		return;
 	ret->transaction = *request;
+	if (request->function == 6)
+		ret->transaction.n = 1;
 	if (request->unit == 0) {
 		perform(d, request, t_ns, ret->transaction.value);
 		return;

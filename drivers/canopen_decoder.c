@@ -2,14 +2,14 @@
  *
  * What a PDO carries is not said in it. It is learned from SDO traffic, whoever's: a value read is learned from the
  * answer, a value written from the request (a log may have lost the answers), and taken back if the node refuses it. A
- * node that boots has forgotten what it was told, so it is forgotten here too; a mapping is read anew before the node is
- * started. Before anything is known, an encoder and an inclinometer are taken to be mapped as their profiles say; a drive
- * is not, since makers do as they like there.
+ * node that boots has forgotten what it was told, so it is forgotten here too; a mapping is read anew before the node
+ * is started. Before anything is known, an encoder and an inclinometer are taken to be mapped as their profiles say; a
+ * drive is not, since makers do as they like there.
  *
- * Which time. The link delivers our own frames as they leave, so both directions come in the order of the bus. A TPDO of
- * transmission type 0..240 was sampled at the SYNC, and its angle has that SYNC's time; where the last one is older than
- * a period, one was missed, and the TPDO's own time is the better one, as it is for all others. Frames written (TO_DEVICE)
- * teach too, for records of a link that does not echo: whatever is learned twice is learned once. */
+ * Which time. The link delivers our own frames as they leave, so both directions come in the order of the bus. A TPDO
+ * of transmission type 0..240 was sampled at the SYNC, and its angle has that SYNC's time; where the last one is older
+ * than a period, one was missed, and the TPDO's own time is the better one, as it is for all others. Frames written
+ * (TO_DEVICE) teach too, for records of a link that does not echo: whatever is learned twice is learned once. */
 #include "drivers/canopen_parts.h"
 
 #include <math.h>
@@ -86,13 +86,13 @@ struct context {
 	struct can_frame_at f;
 };
 
-struct decoder *canopen_decoder_create(const struct config_device *device, int index)
+struct decoder *canopen_decoder_create(const struct config_device *config, int device)
 {
 	struct decoder *d = calloc(1, sizeof *d);
 
 	if (d) {
-		d->device = *device;
-		d->index = index;
+		d->device = *config;
+		d->index = device;
 	}
 	return d;
 }

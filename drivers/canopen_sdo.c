@@ -3,9 +3,9 @@
  *    begin --> [segment -->]* done            of up to 4 bytes the begin is all
  *
  * Segments carry no index, only a bit that toggles, and answers may come late. So an answer counts only while a request
- * is out, of its kind, at its step, and about its object; whatever else comes is counted and left. When the bit does not
- * toggle (a frame can arrive twice on a disturbed bus) or nothing comes, the node is told by an abort, which ends what it
- * thinks of the transfer, before it is begun anew. */
+ * is out, of its kind, at its step, and about its object; whatever else comes is counted and left. When the bit does
+ * not toggle (a frame can arrive twice on a disturbed bus) or nothing comes, the node is told by an abort, which ends
+ * what it thinks of the transfer, before it is begun anew. */
 #include "drivers/canopen_sdo.h"
 
 #include <assert.h>

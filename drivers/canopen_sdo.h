@@ -1,4 +1,5 @@
-/* SDO client of one node: pure. One transfer at a time, of any object up to CANOPEN_SDO_MAX bytes; time is the caller's.
+/* SDO client of one node: pure. One transfer at a time, of any object up to CANOPEN_SDO_MAX bytes; time is the
+ * caller's.
  *
  *   canopen_sdo_upload(c, 0x1018, 1);
  *   while (c->state == CANOPEN_SDO_BUSY): canopen_sdo_step(c, t_ns, &frame) says whether `frame` is to be sent now,
@@ -24,8 +25,7 @@ struct canopen_sdo {
 	bool download;
 	uint32_t abort; /* FAILED: why; CANOPEN_ABORT_TIMEOUT: no answer */
 	bool refused;   /* FAILED: the node aborted it, not this side */
-	bool
-	    sized; /* DONE, upload: the node said the length; else data hold 4 bytes, those beyond its type 0 or noise */
+	bool sized;     /* DONE, upload: the node said the length; else `data` may be longer than the object */
 	size_t len;
 	uint8_t data[CANOPEN_SDO_MAX]; /* uploaded, or to be downloaded */
 

@@ -1,5 +1,5 @@
-/* Set-up of a node. Each object and each PDO is a row of numbered steps; a step is a transfer, or nothing where the node
- * already is as wanted, so a node that was set up before is only read. */
+/* Set-up of a node. Each object and each PDO is a row of numbered steps; a step is a transfer, or nothing where the
+ * node already is as wanted, so a node that was set up before is only read. */
 #include "drivers/canopen_setup.h"
 
 #include <assert.h>

@@ -1,9 +1,10 @@
 /* Set-up of a node by a list of what its objects should hold: pure, over the SDO client. What differs is written, what
- * is as wanted is left alone (many nodes keep their set-up, and their memory wears). Objects first, in order, then PDOs.
+ * is as wanted is left alone (many nodes keep their set-up, and their memory wears). Objects first, in order, then
+ * PDOs.
  *
- * A PDO is set as CiA 301 demands: switched off, type and timers, mapping emptied, entries, count, switched on. Where the
- * mapping is as wanted it is not touched; where all is, nothing is written. The COB-id is switched off as it was read,
- * and its bit 30 (no RTR) kept: some nodes insist on both. */
+ * A PDO is set as CiA 301 demands: switched off, type and timers, mapping emptied, entries, count, switched on. Where
+ * the mapping is as wanted it is not touched; where all is, nothing is written. The COB-id is switched off as it was
+ * read, and its bit 30 (no RTR) kept: some nodes insist on both. */
 #ifndef FACET_DRIVERS_CANOPEN_SETUP_H
 #define FACET_DRIVERS_CANOPEN_SETUP_H
 
@@ -34,7 +35,7 @@ struct canopen_pdo {
 	uint16_t index;                      /* 1400.. or 1800..: the mapping is at index + 0x200 */
 	bool optional;                       /* a node that lacks this PDO is passed over */
 	bool off;                            /* is not to exist; the rest does not matter then */
-	uint32_t cob;                        /* id; bits 30 and 31 as above. 0: as the node has it */
+	uint32_t cob;                        /* id, and CANOPEN_COB_EXTENDED; 0: as the node has it */
 	uint8_t type;                        /* transmission type */
 	int inhibit;                         /* 100 us, sub 3; -1: as it is */
 	int timer;                           /* ms, sub 5; -1: as it is */

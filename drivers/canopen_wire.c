@@ -17,8 +17,8 @@
  *    n  bytes at the end that hold no data       e  expedited: the data are here        s  n (or the size) is said
  *    t  toggles from segment to segment          c  no more segments
  *
- * Seen in the field: answers that end with their data, or with the sub-index; answers to writes that echo the data; reads
- * of short objects whose length is not said, so that only the object's type tells it. */
+ * Seen in the field: answers that end with their data, or with the sub-index; answers to writes that echo the data;
+ * reads of short objects whose length is not said, so that only the object's type tells it. */
 #include "drivers/canopen_wire.h"
 
 #include <assert.h>

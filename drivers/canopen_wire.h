@@ -84,7 +84,8 @@ struct canopen_wire_sdo {
 void canopen_wire_put_request(const struct canopen_wire_sdo *, uint8_t ret[8]);
 void canopen_wire_put_answer(const struct canopen_wire_sdo *, uint8_t ret[8]);
 /* False: too short for what it claims to be. Short frames are taken where what they lack is not used: an answer ends
- * with its data, a code that an abort does not hold is 0x08000000. Data echoed in an answer to a download are ignored. */
+ * with its data, a code that an abort does not hold is 0x08000000. Data echoed in an answer to a download are ignored.
+ * */
 bool canopen_wire_parse_request(const uint8_t *bytes, size_t len, struct canopen_wire_sdo *ret);
 bool canopen_wire_parse_answer(const uint8_t *bytes, size_t len, struct canopen_wire_sdo *ret);
 /* Data of up to 4 bytes as a number, little-endian. */

@@ -1,7 +1,7 @@
 /* Laws L7 and L8: no frames crash the decoder of CANopen nodes, its SDO client, its set-up or its dialogue, or give an
- * angle that is no number; a snapshot says all that it goes on from. The first two bytes choose device and transfer; what
- * follows are whole entries of frames, or short ones: a byte of who, which way and when, a length, the data; or an answer,
- * good in form, to what was asked last, so that inputs come far. */
+ * angle that is no number; a snapshot says all that it goes on from. The first two bytes choose device and transfer;
+ * what follows are whole entries of frames, or short ones: a byte of who, which way and when, a length, the data; or
+ * an answer, good in form, to what was asked last, so that inputs come far. */
 #include <math.h>
 #include <stdint.h>
 #include <stdlib.h>

@@ -1,5 +1,6 @@
-/* Law L8: a node that is mapped otherwise is set right once, over the wire and in its own order; whoever comes next finds
- * it so and writes nothing of its set-up. Driver and simulated node in virtual time, joined by a bus that echoes. */
+/* Law L8: a node that is mapped otherwise is set right once, over the wire and in its own order; whoever comes next
+ * finds it so and writes nothing of its set-up. Driver and simulated node in virtual time, joined by a bus that
+ * echoes. */
 #include <setjmp.h>
 #include <stdarg.h>
 #include <stddef.h>

@@ -9,8 +9,8 @@
  *     (2020-11-06 13:10:55.310219)  can0  181   [5]  remote request
  *    DROPCOUNT: dropped 5 CAN frames on 'can0' socket (total drops 5)
  *
- * An id of 3 digits is standard, of 8 extended, or an error frame where it has that flag: the number of digits alone tells
- * 001 from 00000001. */
+ * An id of 3 digits is standard, of 8 extended, or an error frame where it has that flag: the number of digits alone
+ * tells 001 from 00000001. */
 #include "tools/candump.h"
 
 #include <string.h>

@@ -1015,6 +1015,27 @@ static void two_nodes_stand_on_one_axis(void **state)
 	assert_int_equal(sim_canopen_create(&params, bed.t_ns, &encoder), -EINVAL);
 }
 
+/* ... in every state, and is alive when all is taken back. */
+static void every_fault_that_it_lists_it_takes(void **state)
+{
+	(void)state;
+	for (int kind = SIM_CANOPEN_DRIVE; kind <= SIM_CANOPEN_INCLINOMETER; kind++) {
+		begin((enum sim_canopen_kind)kind);
+		for (int i = 0; bed.device.fault_kinds[i]; i++) {
+			nmt(0x01);
+			order(bed.device.fault_kinds[i], 0, SECOND, true);
+			say_sync();
+			run(3 * SECOND);
+			order(bed.device.fault_kinds[i], 0, SECOND, false);
+			run(SECOND);
+			assert_true(bed.device.alive(bed.device.ctx));
+			assert_int_equal(sdo_read(0x1018, 4), NODE);
+			bed.n = 0;
+		}
+		assert_false(bed.device.fault(bed.device.ctx, &(struct sim_fault){.kind = "nonsense"}, true, bed.t_ns));
+	}
+}
+
 /* Any frame, any bytes, cut anywhere: it lives, and what it sends is whole. */
 static void whatever_is_on_the_bus_it_lives(void **state)
 {
@@ -1215,6 +1236,7 @@ int main(void)
 	    cmocka_unit_test(an_encoder_counts_modulo_its_range),
 	    cmocka_unit_test(an_inclinometer_measures_in_its_resolution),
 	    cmocka_unit_test(two_nodes_stand_on_one_axis),
+	    cmocka_unit_test(every_fault_that_it_lists_it_takes),
 	    cmocka_unit_test(whatever_is_on_the_bus_it_lives),
 	    cmocka_unit_test(a_run_is_the_same_every_time),
 	    cmocka_unit_test(the_start_up_of_two_real_drives_goes_the_same_way_with_simulated_ones),

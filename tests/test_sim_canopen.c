@@ -579,6 +579,63 @@ static void profile_position_goes_where_it_is_sent_and_shakes_hands(void **state
 	assert_true(fabs(degrees() - 60.0) < 1e-9);
 }
 
+static void set_point(int32_t target)
+{
+	assert_int_equal(sdo_write(0x607A, 0, (uint32_t)target, 4), 0);
+	control(0x1f);
+	control(0x0f);
+}
+
+static void a_third_set_point_is_not_taken_while_the_second_waits(void **state)
+{
+	(void)state;
+	begin(SIM_CANOPEN_DRIVE);
+	enable(1);
+	set_point(5000);
+	set_point(7000);
+	set_point(9000);
+	run(5 * SECOND);
+	assert_true(fabs(degrees() - 7.0) < 1e-9);
+}
+
+static void no_speed_is_above_that_of_607F(void **state)
+{
+	(void)state;
+	begin(SIM_CANOPEN_DRIVE);
+	assert_int_equal(sdo_write(0x6081, 0, 80000, 4), 0);
+	assert_int_equal(sdo_write(0x607F, 0, 20000, 4), 0);
+	enable(1);
+	set_point(60000);
+	run(SECOND);
+	assert_true(fabs(sim_axis_speed(bed.axis, bed.t_ns) / DEG - 20.0) < 1e-9);
+	assert_int_equal(sdo_write(0x6060, 0, 3, 1), 0);
+	assert_int_equal(sdo_write(0x60FF, 0, (uint32_t)-80000, 4), 0);
+	run(SECOND);
+	assert_true(fabs(sim_axis_speed(bed.axis, bed.t_ns) / DEG + 20.0) < 1e-9);
+}
+
+/* Word and target in one frame, in that order: the target is the one that came with the edge. */
+static void a_control_word_acts_with_the_target_that_came_with_it(void **state)
+{
+	static const uint16_t words[] = {0x0f, 0x1f, 0x0f, 0x1f};
+	static const int32_t targets[] = {3000, 4000, 9000, 8000};
+
+	(void)state;
+	begin(SIM_CANOPEN_DRIVE);
+	map_cyclic(1);
+	assert_int_equal(sdo_write(0x1400, 2, 255, 1), 0);
+	nmt(0x01);
+	enable(1);
+	for (int i = 0; i < 4; i++) {
+		uint8_t bytes[6] = {(uint8_t)words[i], 0, (uint8_t)targets[i], (uint8_t)(targets[i] >> 8)};
+
+		say(0x202, bytes, sizeof bytes);
+		run(2 * SECOND);
+		if (i % 2)
+			assert_true(fabs(degrees() * 1000 - targets[i]) < 1e-6);
+	}
+}
+
 static void soft_limits_clip_targets_and_say_so(void **state)
 {
 	(void)state;
@@ -1223,6 +1280,9 @@ int main(void)
 	    cmocka_unit_test(the_state_machine_is_the_standards),
 	    cmocka_unit_test(a_fault_is_left_by_a_rising_edge_only_and_not_while_it_lasts),
 	    cmocka_unit_test(profile_position_goes_where_it_is_sent_and_shakes_hands),
+	    cmocka_unit_test(a_third_set_point_is_not_taken_while_the_second_waits),
+	    cmocka_unit_test(no_speed_is_above_that_of_607F),
+	    cmocka_unit_test(a_control_word_acts_with_the_target_that_came_with_it),
 	    cmocka_unit_test(soft_limits_clip_targets_and_say_so),
 	    cmocka_unit_test(cyclic_positions_are_reached_a_cycle_after_their_sync),
 	    cmocka_unit_test(an_axis_that_does_not_follow_is_a_fault_in_every_mode),

@@ -100,7 +100,7 @@ static bool publish(struct worker *w);
 static bool begin_anew(struct worker *w, bool ended)
 {
 	w->result->reset = true;
-	w->result->ended = ended;
+	w->result->ended |= ended;
 	w->result->arrivals = 0;
 	return begin_map(w);
 }

@@ -143,6 +143,28 @@ grep -q 'jumped back by .* degrees: the map goes on' "$scratch/keep.daemon.log" 
 holds "d['pose']['jumps'] == 2" || fail "keep: the status counts other jumps"
 end
 
+# With odometry: poses come once a second, and a jump is told by what the wheels say. While the wheels are silent no row is
+# placed by a guess.
+begin keep-odometry --odometry
+holds "0 <= d['odometry']['sigma']['position'] < 0.2 and d['odometry']['jumps'] == 0" || fail "odometry: $(status "d['odometry']")"
+touch "$dir/moved"
+until_true sees "len(e) == 1 and e[0]['done'] == 'keep' and abs(e[0]['angle'] - 0.349) < 0.02" || fail "odometry: $(events e)"
+stale=$(status "s['rows']['dropped']['stale pose']")
+python3 - "$dir/simulator.sock" <<'END' >/dev/null || fail "odometry: no fault to be had"
+import socket, sys
+s = socket.socket(socket.AF_UNIX)
+s.connect(sys.argv[1])
+s.sendall(b"odometry: silence for 4s\n")
+print(s.recv(1000))
+END
+until_true holds "s['rows']['dropped']['stale pose'] > $stale + 50" || fail "odometry: rows are placed without a pose"
+until_true holds "d['odometry']['state'] == 'streaming' and d['odometry']['gaps'] >= 1" || fail "odometry: the wheels are not back"
+step=$(status "s['step']")
+until_true holds "s['step'] > $step + 60" || fail "odometry: the map stands"
+sees "len(e) == 1" || fail "odometry: corrections are told as jumps: $(events e)"
+echo "note: odometry: $(status "'%.0f mm, %.2f degrees, %d rows dropped in a silence of 4 s' % (1000 * d['odometry']['sigma']['position'], 57.3 * d['odometry']['sigma']['heading'], s['rows']['dropped']['stale pose'])")"
+end
+
 # ignore: the map stays sound, as if nothing had been.
 begin ignore
 touch "$dir/moved"

@@ -473,6 +473,60 @@ static void after_a_reset_every_client_begins_anew(void **state)
 	publisher_destroy(p);
 }
 
+/* One client is in the middle of a frame of the old map, which is copied; the rest goes to its new owner as it is. */
+static void a_map_that_ends_is_handed_out_whole(void **state)
+{
+	static const uint8_t next[16] = {1, 2, 3, 4, 5, 6, 7, 8, 9, 10, 11, 12, 13, 14, 15, 16};
+	static struct history h;
+	struct publisher *p = start(&h, 200, 0);
+	struct publisher_stats stats;
+	struct publisher_old *old;
+	struct reader reader, slow;
+	size_t living = 0;
+
+	(void)state;
+	reader_open(&reader, p);
+	reader_open(&slow, p);
+	for (int i = 0; i < 10; i++)
+		advance_history(&h, p, 30);
+	expect_converged(&reader, &h);
+	write_some(slow.client, 3000);
+	publisher_stats(p, &stats);
+	old = publisher_begin_map(p, next);
+	assert_non_null(old);
+	for (size_t i = 0; i < publisher_old_count(old); i++) {
+		struct native_message message;
+		char error[128];
+		size_t len;
+		const uint8_t *frame = publisher_old_frame(old, i, &len);
+		uint32_t key;
+
+		assert_int_equal(native_decode(frame, len, &message, error), 0);
+		key = (uint32_t)(message.patch->key.x + KEYS / 2);
+		struct patch *truth = make_patch(key, h.content[h.step][key], h.version[h.step][key], h.side);
+		assert_true(patch_equal(truth, message.patch));
+		patch_unref(truth);
+		native_message_finish(&message);
+		living++;
+	}
+	assert_int_equal(living, stats.patches);
+	publisher_old_destroy(old);
+	publisher_stats(p, &stats);
+	assert_int_equal(stats.patches, 0);
+	assert_int_equal(stats.bytes, 0);
+	assert_int_equal(stats.generation, 2);
+	memset(&h, 0, sizeof(h));
+	h.side = 200;
+	advance_history(&h, p, 30);
+	expect_converged(&reader, &h);
+	assert_memory_equal(native_mirror_hello(reader.mirror)->map_id, next, 16);
+	reader_close(&reader);
+	reader_close(&slow);
+	publisher_stats(p, &stats);
+	assert_int_equal(stats.pinned, 0);
+	publisher_destroy(p);
+}
+
 static void a_step_without_a_changed_patch_is_committed_too(void **state)
 {
 	static struct history h;
@@ -630,6 +684,7 @@ int main(void)
 	    cmocka_unit_test(a_list_of_pins_is_counted_and_never_longer_than_64_kb),
 	    cmocka_unit_test(removals_under_a_stalled_client_are_limited_too),
 	    cmocka_unit_test(after_a_reset_every_client_begins_anew),
+	    cmocka_unit_test(a_map_that_ends_is_handed_out_whole),
 	    cmocka_unit_test(a_step_without_a_changed_patch_is_committed_too),
 	    cmocka_unit_test(the_counts_of_faces_and_patches_follow_the_map),
 	    cmocka_unit_test(messages_come_between_frames_and_are_bounded),

@@ -70,9 +70,8 @@ struct dialogue {
 	uint32_t beat_ms;  /* it produces one so often; 0: none */
 	int64_t quiet_ns;  /* without an angle, as far as it was looked */
 	int64_t unbeat_ns; /* ... without a heartbeat */
-	bool angle_known, beat_known, started, nothing_written;
+	bool angle_known, beat_known, started;
 	int64_t start_due_ns;
-	uint64_t nmt_due; /* commands to be sent, as bits */
 
 	int64_t sync_due_ns, beat_due_ns;
 	bool sync_heard;
@@ -97,7 +96,7 @@ struct dialogue {
 	bool speed_sent, target_sent;
 	double sent_rad_s, sent_rad;
 	uint32_t speeds, taken;
-	bool homed_here; /* by this program, in this life of the drive */
+	bool booted; /* since it was last homed */
 
 	struct canopen_wire_emcy emcy;
 	int64_t emcy_ns;
@@ -188,11 +187,19 @@ static void begin(struct dialogue *d, int64_t t_ns)
 	d->asleep = d->asked = d->begun = d->halting = false;
 	d->angle_known = d->beat_known = false;
 	d->quiet_ns = d->unbeat_ns = 0;
-	d->nmt_due = 0;
 	d->lacks[0] = 0;
 	d->drive.phase = CANOPEN_DRIVE_IDLE;
 	canopen_sdo_init(&d->sdo, d->device.node);
 	identify(d, t_ns);
+}
+
+/* What it was doing is over: the drive is to stand, whatever it still hears. */
+static void let_go(struct dialogue *d)
+{
+	sweeper_halt(&d->sweeper, "");
+	d->begun = false;
+	d->release |= d->drive.phase > CANOPEN_DRIVE_CALMING && d->drive.phase < CANOPEN_DRIVE_ENDING;
+	d->drive.phase = CANOPEN_DRIVE_IDLE;
 }
 
 void canopen_dialogue_reset(struct dialogue *d, int64_t t_ns)
@@ -205,16 +212,8 @@ void canopen_dialogue_reset(struct dialogue *d, int64_t t_ns)
 	d->why[0] = 0;
 	memset(&d->emcy, 0, sizeof d->emcy);
 	d->health = CAN_BUS_ACTIVE;
+	let_go(d);
 	begin(d, t_ns);
-}
-
-/* What it was doing is over: the drive is to stand, whatever it still hears. */
-static void let_go(struct dialogue *d)
-{
-	sweeper_halt(&d->sweeper, "");
-	d->begun = false;
-	d->release |= d->drive.phase > CANOPEN_DRIVE_CALMING && d->drive.phase < CANOPEN_DRIVE_ENDING;
-	d->drive.phase = CANOPEN_DRIVE_IDLE;
 }
 
 static void again(struct dialogue *d, const char *why, int64_t t_ns)
@@ -254,6 +253,7 @@ static void take_nmt(struct dialogue *d, uint8_t state, int64_t t_ns)
 	if (state == CANOPEN_BOOT_UP) {
 		d->nmt = CANOPEN_PREOPERATIONAL;
 		canopen_drive_booted(&d->drive);
+		d->booted = true;
 		memset(&d->emcy, 0, sizeof d->emcy);
 		if (d->stage == RESETTING)
 			begin(d, t_ns);
@@ -617,6 +617,10 @@ static void list_commanding(struct dialogue *d)
 	canopen_setup_heartbeat(&d->setup, (uint16_t)d->beat_ms, d->device.master, (uint16_t)(BEATS * d->beat_ms));
 	canopen_setup_object(&d->setup, &stop[0]);
 	canopen_setup_object(&d->setup, &stop[1]);
+	if (d->device.homing.set) {
+		learn_object(d, 0x6098, 0, 1);
+		learn_object(d, 0x607c, 0, 4);
+	}
 	add_pdo(d, 0x1800, CANOPEN_TPDO, has_sync(d) ? 1 : TYPE_EVENT, CANOPEN_MAP(0x6041, 0, 16),
 	        CANOPEN_MAP(0x6064, 0, 32));
 	add_pdo(d, 0x1400, CANOPEN_RPDO, cyclic ? 1 : TYPE_EVENT, CANOPEN_MAP(0x6040, 0, 16),
@@ -681,16 +685,25 @@ static void note_lacks(struct dialogue *d)
 		         "it has no object 6007: see its handbook for what it does when heartbeats are missing");
 }
 
+/* Homing anew costs a way and is always right, but 35 and 37 call home wherever it stands. Then it counts that nothing had
+ * to be written: a drive that still has all it was told (by an earlier life of this program, perhaps) was not switched off
+ * since, and knows where it is. */
+static bool is_homed(const struct dialogue *d)
+{
+	const struct canopen_drive_setup *wanted = &d->drive.setup;
+	uint32_t method, offset;
+
+	if (!wanted->homes || (wanted->method != 35 && wanted->method != 37) || d->booted || d->setup.written > 0)
+		return false;
+	return canopen_setup_value(&d->setup, 0x6098, 0, &method) && (int8_t)method == wanted->method &&
+	       canopen_setup_value(&d->setup, 0x607c, 0, &offset) && (int32_t)offset == wanted->home_count;
+}
+
 static void set_done(struct dialogue *d, int64_t t_ns)
 {
-	d->nothing_written = d->setup.written == 0;
 	note_lacks(d);
 	set_up_drive(d);
-	if (!d->nothing_written || !d->homed_here)
-		d->drive.homed = false;
-	/* Homing anew costs a way, but method 35 and 37 would call home wherever it is. */
-	else if (d->device.homing.method != 35 && d->device.homing.method != 37)
-		d->drive.homed = false;
+	d->drive.homed = is_homed(d);
 	d->start_due_ns = t_ns;
 	d->angle_known = false;
 	enter(d, STARTING, t_ns);
@@ -936,7 +949,6 @@ static void lead(struct dialogue *d, int64_t t_ns)
 static void command(struct dialogue *d, int64_t t_ns, struct dialogue_step *ret)
 {
 	struct canopen_drive_wish wish;
-	const int32_t before = d->drive.homed;
 
 	if (!d->commands || d->stage < RUNNING || d->stage > ENDING)
 		return;
@@ -954,7 +966,7 @@ static void command(struct dialogue *d, int64_t t_ns, struct dialogue_step *ret)
 			canopen_drive_step(&d->drive, t_ns, &wish);
 		}
 	}
-	d->homed_here |= !before && d->drive.homed;
+	d->booted &= !d->drive.homed;
 	if (wish.deadline_ns < ret->deadline_ns)
 		ret->deadline_ns = wish.deadline_ns;
 	if (d->stage == STOPPING && d->drive.phase != CANOPEN_DRIVE_RUNNING) {

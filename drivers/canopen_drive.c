@@ -67,18 +67,6 @@ static const struct object {
 };
 #define OBJECTS ((int)(sizeof object / sizeof object[0]))
 
-const char *canopen_drive_phase_text(enum canopen_drive_phase phase)
-{
-	static const char *const text[] = {"is listened to",    "is asked for its state",
-	                                   "is reset",          "is made to stand",
-	                                   "is prepared",       "changes its mode",
-	                                   "is enabled",        "is homed",
-	                                   "does as it's told", "stands",
-	                                   "is stopped",        "was stopped"};
-
-	return text[phase];
-}
-
 void canopen_drive_init(struct canopen_drive *d, const struct canopen_drive_setup *setup)
 {
 	memset(d, 0, sizeof *d);

@@ -135,6 +135,4 @@ void canopen_drive_end(struct canopen_drive *, int64_t t_ns);
 
 void canopen_drive_step(struct canopen_drive *, int64_t t_ns, struct canopen_drive_wish *ret);
 
-const char *canopen_drive_phase_text(enum canopen_drive_phase); /* "is enabled", ... */
-
 #endif

@@ -31,7 +31,8 @@ struct bed {
 	struct sim_device brain;
 	int64_t t_ns, open_ns; /* the link is opened anew then */
 	struct dialogue_step step;
-	bool deaf; /* frames get lost, both ways */
+	bool deaf;                          /* frames get lost, both ways */
+	int64_t foreign_ns, foreign_due_ns; /* somebody else sends SYNC so often; 0: nobody */
 
 	/* What was seen. */
 	int streams, losses, failures, notes;
@@ -217,13 +218,39 @@ static int64_t earlier(int64_t a, int64_t b)
 	return a < b ? a : b;
 }
 
+static void pass(struct bed *b, const struct can_frame_at *frame)
+{
+	struct can_frame_at f = *frame;
+	uint8_t entry[CAN_WIRE_ENTRY_FD];
+
+	f.t_ns = b->t_ns;
+	const size_t n = can_wire_put(&f, entry);
+
+	b->brain.receive(b->brain.ctx, entry, n, b->t_ns);
+	decode(b, FROM_DEVICE, entry, n);
+}
+
+static void foreign(struct bed *b)
+{
+	const struct can_frame_at frame = canopen_wire_sync();
+
+	if (b->foreign_ns == 0 || b->t_ns < b->foreign_due_ns)
+		return;
+	pass(b, &frame);
+	b->foreign_due_ns = b->t_ns + b->foreign_ns;
+}
+
 static void run(struct bed *b, double seconds)
 {
 	const int64_t end_ns = b->t_ns + (int64_t)(seconds * 1e9);
 
 	while (b->t_ns < end_ns) {
+		foreign(b);
 		converse(b);
 		int64_t next_ns = earlier(b->brain.deadline(b->brain.ctx), end_ns);
+
+		if (b->foreign_ns)
+			next_ns = earlier(next_ns, b->foreign_due_ns);
 
 		next_ns = earlier(next_ns, b->open_ns != INT64_MAX ? b->open_ns : b->step.deadline_ns);
 		b->t_ns = next_ns > b->t_ns ? next_ns : b->t_ns + 100000;
@@ -750,14 +777,156 @@ static void answers_that_are_strange_or_missing_are_lived_with(void **state)
 
 static void what_it_refuses_to_be_set_is_said(void **state)
 {
-	struct bed b;
+	static const struct {
+		int object;
+		const char *note, *failure;
+	} row[] = {{0x6007, "it has no object 6007", NULL},
+	           {0x605a, "", NULL},
+	           {0x6083, "object 6083:00 cannot be set", NULL},
+	           {0x6060, "refuses the mode", NULL},
+	           {0x1a00, NULL, "1A00"},
+	           {0x1000, NULL, "1000"}};
 
 	(void)state;
-	lay_servo(&b, ", mode: position", "");
-	befall(&b, "sdo abort", 0x6007);
-	befall(&b, "sdo abort", 0x6007);
-	run(&b, 3.0);
-	assert_int_equal(b.step.state, DIALOGUE_STREAMING);
+	for (size_t i = 0; i < sizeof row / sizeof row[0]; i++) {
+		struct bed b;
+
+		lay_servo(&b, ", mode: position", "");
+		fault(&b, "sdo abort", row[i].object, true);
+		run(&b, 5.0);
+		assert_int_equal(b.step.state == DIALOGUE_STREAMING, row[i].note != NULL);
+		assert_non_null(
+		    strstr(row[i].note ? b.step.error : b.failed, row[i].note ? row[i].note : row[i].failure));
+		clear(&b);
+	}
+}
+
+static void the_limits_of_the_drive_are_honoured_before_anything_is_sent(void **state)
+{
+	(void)state;
+	for (int m = 0; m < 3; m++) {
+		struct bed b;
+		const uint8_t low[] = {0x23, 0x7d, 0x60, 1, 0xf0, 0xd8, 0xff, 0xff},
+		              high[] = {0x23, 0x7d, 0x60, 2, 0x10, 0x27, 0, 0};
+
+		lay_servo(&b, mode[m], "");
+		run(&b, 0.05);
+		for (int i = 0; i < 2; i++) { /* -10 and 10 degrees */
+			const struct can_frame_at f = can_wire_frame(CANOPEN_SDO_REQUEST + 5, i ? high : low, 8);
+
+			pass(&b, &f);
+			run(&b, 0.01);
+		}
+		b.open_ns = b.t_ns;
+		run(&b, 10.0);
+		assert_int_equal(b.step.state, DIALOGUE_STREAMING);
+		assert_non_null(strstr(b.step.error, "its limits are -10.0 and 10.0"));
+		assert_true(b.highest < -1e8 || (b.lowest >= -10.001 * DEG && b.highest <= 10.001 * DEG));
+		assert_true(b.angle_low > -10.001 * DEG && b.angle_high < 10.001 * DEG);
+		clear(&b);
+	}
+}
+
+static void limits_of_the_configuration_hold_in_every_mode(void **state)
+{
+	(void)state;
+	for (int m = 0; m < 3; m++) {
+		struct bed b;
+		char keys[120];
+
+		snprintf(keys, sizeof keys, "%s, limits: [-20deg, 30deg]", mode[m]);
+		lay_servo(&b, keys, "");
+		expect_sweeping(&b);
+		clear(&b);
+	}
+}
+
+static void a_mapping_that_is_lost_is_set_again(void **state)
+{
+	(void)state;
+	for (int m = 0; m < 3; m++) {
+		struct bed b;
+
+		lay_servo(&b, mode[m], "");
+		run(&b, 4.0);
+		befall(&b, "mapping", 0);
+		run(&b, 10.0);
+		expect_sweeping(&b);
+		assert_true(b.losses >= 1);
+		clear(&b);
+	}
+}
+
+static void a_fault_before_the_first_sweep_is_reset(void **state)
+{
+	(void)state;
+	for (int m = 0; m < 3; m++) {
+		struct bed b;
+
+		lay_servo(&b, mode[m], "");
+		run(&b, 0.03);
+		befall(&b, "fault", 0x3210);
+		run(&b, 2.0);
+		expect_sweeping(&b);
+		assert_int_equal(b.resets, 1);
+		clear(&b);
+	}
+}
+
+static void it_is_taken_up_in_mid_sweep(void **state)
+{
+	(void)state;
+	for (int ms = 0; ms < 3000; ms += 170) {
+		struct bed b;
+
+		lay_servo(&b, mode[ms / 10 % 3], "");
+		run(&b, 2.0 + ms * 1e-3);
+		/* A new life of the program; the drive is as the old one left it. */
+		b.driver->dialogue_destroy(b.dialogue);
+		b.driver->decoder_destroy(b.decoder);
+		b.decoder = b.driver->decoder_create(&b.config.device[0], 0);
+		b.dialogue = b.driver->dialogue_create(&b.config, 0);
+		b.open_ns = b.t_ns;
+		run(&b, 2.0);
+		expect_sweeping(&b);
+		/* Told a speed, it goes on with it until it is taken up. */
+		const double on = ms / 10 % 3 == 1 ? 5.0 : 0.0;
+
+		expect_within(&b, -20.0 - on, 30.0 + on);
+		assert_int_equal(b.resets, 0);
+		clear(&b);
+	}
+}
+
+static void somebody_elses_sync_leads_as_well(void **state)
+{
+	static const int64_t period_ms[] = {5, 10, 20};
+
+	(void)state;
+	for (int m = 0; m < 3; m++)
+		for (int i = 0; i < 3; i++) {
+			struct bed b;
+			char keys[80];
+
+			snprintf(keys, sizeof keys, "%s, sync: 0", mode[m]);
+			lay_servo(&b, keys, "");
+			b.foreign_ns = period_ms[i] * MS;
+			run(&b, 1.0);
+			expect_sweeping(&b);
+			assert_true(b.error_max <= 0.0011 * DEG);
+			expect_within(&b, -20.6, 30.6);
+			clear(&b);
+		}
+	struct bed b;
+
+	lay_servo(&b, ", mode: cyclic, sync: 0", "");
+	run(&b, 5.0);
+	assert_int_equal(b.streams, 0);
+	assert_non_null(strstr(b.failed, "nobody sends it"));
+	clear(&b);
+	lay_servo(&b, ", mode: velocity, sync: 0", ""); /* the others can do without */
+	run(&b, 1.0);
+	expect_sweeping(&b);
 	clear(&b);
 }
 
@@ -792,6 +961,33 @@ static void an_unhomed_drive_is_homed_first(void **state)
 			assert_true(b.error_max <= 0.5 * DEG);
 			clear(&b);
 		}
+}
+
+static void here_is_home_only_once(void **state)
+{
+	(void)state;
+	for (int off = 0; off < 2; off++) {
+		struct sim_canopen_params params = servo;
+		struct bed b;
+
+		params.unhomed = true;
+		lay(&b, &params, "devices:\n  - " SERVO ", homing: {method: 35}}\n" SWEEP "}\n");
+		run(&b, 5.3);
+		assert_true(b.error_max <= 0.0011 * DEG);
+		assert_true(fabs(b.last.angle_rad) > 1.0 * DEG);
+		if (off)
+			befall(&b, "power cycle", 1.0); /* where it stands then, it was told, is home */
+		b.driver->dialogue_destroy(b.dialogue);
+		b.driver->decoder_destroy(b.decoder);
+		b.decoder = b.driver->decoder_create(&b.config.device[0], 0);
+		b.dialogue = b.driver->dialogue_create(&b.config, 0);
+		b.open_ns = b.t_ns;
+		run(&b, 4.0);
+		b.error_max = 0.0;
+		expect_sweeping(&b);
+		assert_int_equal(b.error_max > 0.5 * DEG, off);
+		clear(&b);
+	}
 }
 
 static void homing_that_fails_is_a_note(void **state)
@@ -940,7 +1136,14 @@ int main(void)
 	    cmocka_unit_test(an_emergency_is_a_note_and_no_more),
 	    cmocka_unit_test(answers_that_are_strange_or_missing_are_lived_with),
 	    cmocka_unit_test(what_it_refuses_to_be_set_is_said),
+	    cmocka_unit_test(the_limits_of_the_drive_are_honoured_before_anything_is_sent),
+	    cmocka_unit_test(limits_of_the_configuration_hold_in_every_mode),
+	    cmocka_unit_test(a_mapping_that_is_lost_is_set_again),
+	    cmocka_unit_test(a_fault_before_the_first_sweep_is_reset),
+	    cmocka_unit_test(it_is_taken_up_in_mid_sweep),
+	    cmocka_unit_test(somebody_elses_sync_leads_as_well),
 	    cmocka_unit_test(an_unhomed_drive_is_homed_first),
+	    cmocka_unit_test(here_is_home_only_once),
 	    cmocka_unit_test(homing_that_fails_is_a_note),
 	    cmocka_unit_test(a_drive_without_a_sweep_is_only_listened_to),
 	    cmocka_unit_test(sensors_are_read),

@@ -7,9 +7,10 @@
  * drive is not, since makers do as they like there.
  *
  * Which time. The link delivers our own frames as they leave, so both directions come in the order of the bus. A TPDO
- * of transmission type 0..240 was sampled at the SYNC, and its angle has that SYNC's time; where the last one is older
- * than a period, one was missed, and the TPDO's own time is the better one, as it is for all others. Frames written
- * (TO_DEVICE) teach too, for records of a link that does not echo: whatever is learned twice is learned once. */
+ * of transmission type 0..240 was sampled at the SYNC, and its angle has that SYNC's time; where that one was missed,
+ * the TPDO's own time is the better one, as it is for all others; where it may be one of several, the angle is not used
+ * (canopen_pairing.h). Frames written (TO_DEVICE) teach too, for records of a link that does not echo: whatever is
+ * learned twice is learned once. */
 #include "drivers/canopen_parts.h"
 
 #include <math.h>
@@ -17,6 +18,7 @@
 #include <string.h>
 
 #include "core/trig.h"
+#include "drivers/canopen_pairing.h"
 #include "drivers/jitter.h"
 
 #define PDOS            8 /* of either way: more are not looked at */
@@ -39,14 +41,14 @@ enum {
 	UNMAPPED,
 	SHORT,
 	NO_SCALE,
-	REPEATED,
+	UNDATED, /* a second angle of the same SYNC, or one of nobody knows which */
 	FOREIGN,
 	MALFORMED,
 	COUNTERS
 };
 static const char *const counter_name[COUNTERS] = {"angles", "statuswords", "heartbeats", "boot-ups",    "emergencies",
                                                    "sdo",    "aborts",      "syncs",      "sync missed", "not mapped",
-                                                   "short",  "no scale",    "repeated",   "foreign",     "malformed"};
+                                                   "short",  "no scale",    "undated",    "foreign",     "malformed"};
 _Static_assert(COUNTERS + CAN_BUS_COUNTERS <= DECODER_COUNTERS_MAX, "the counters of a decoder have a limit");
 
 struct value { /* of an object, as far as it is known */
@@ -55,6 +57,7 @@ struct value { /* of an object, as far as it is known */
 };
 struct pdo {
 	struct value cob, type, count, entry[PDO_ENTRIES];
+	struct canopen_pairing pairing; /* of one that the node transmits */
 };
 
 struct decoder {
@@ -220,6 +223,7 @@ static void pdo_of(const struct decoder *d, bool transmit, int number, struct ca
 			ret->entry[i] = pdo->entry[i].v;
 		}
 	}
+	ret->number = number;
 	ret->type = pdo->type.known ? (uint8_t)pdo->type.v : ret->type;
 	if (pdo->cob.known)
 		ret->cob = pdo->cob.v;
@@ -305,26 +309,37 @@ static void take_sync(struct decoder *d, const struct context *c)
 	}
 	d->synced = true;
 	d->sync_ns = c->f.t_ns;
+	for (int i = 0; i < PDOS; i++)
+		canopen_pairing_sync(&d->pdo[1][i].pairing);
 	say(d, c, CANOPEN_REPLY_SYNC, NULL, 0);
 }
 
-/* When the values of a TPDO were sampled. */
-static int64_t sampled_ns(struct decoder *d, const struct context *c, const struct canopen_learned *pdo)
+/* When the values of a TPDO were sampled; false: at one of several SYNCs. */
+static bool sampled_ns(struct decoder *d, const struct context *c, const struct canopen_learned *pdo, int64_t *ret_ns)
 {
 	const int64_t gap_ns = d->sync_gap_ns > 0 ? d->sync_gap_ns : SYNC_DEFAULT_NS;
 	const int64_t period_ns = d->device.sync_ns > 0 ? d->device.sync_ns : gap_ns;
 	const int64_t late_ns = c->f.t_ns - d->sync_ns;
+	const bool missed = !d->synced || late_ns < 0 || late_ns > period_ns;
 
 	d->every = 0;
+	*ret_ns = c->f.t_ns;
 	if (pdo->type > CANOPEN_TYPE_SYNC_MAX)
-		return c->f.t_ns;
+		return true;
 	d->every = pdo->type ? pdo->type : 1;
-	if (!d->synced || late_ns < 0 || late_ns > period_ns) {
+	/* Type 0 answers when something has changed, which need not be. */
+	if (pdo->type && d->synced &&
+	    !canopen_pairing_take(&d->pdo[1][pdo->number].pairing, pdo->type, late_ns, period_ns)) {
+		d->count[UNDATED]++;
+		return false;
+	}
+	if (missed) {
 		d->count[SYNC_MISSED]++;
-		return c->f.t_ns;
+		return true;
 	}
 	jitter_note(&d->jitter, late_ns);
-	return d->sync_ns;
+	*ret_ns = d->sync_ns;
+	return true;
 }
 
 static bool scale_of(const struct decoder *d, double *ret_rad)
@@ -345,7 +360,7 @@ static void take_angle(struct decoder *d, const struct context *c, int64_t t_ns,
 		return;
 	}
 	if (d->turned && t_ns <= d->angle_ns && t_ns > d->angle_ns - BACK_NS) {
-		d->count[REPEATED]++;
+		d->count[UNDATED]++;
 		return;
 	}
 	angle.rad = canopen_angle_rad(&d->device, scale_rad, count);
@@ -377,7 +392,8 @@ static int64_t signed_of(uint64_t raw, unsigned bits)
 	return (int64_t)((raw ^ sign) - sign);
 }
 
-static void take_value(struct decoder *d, const struct context *c, uint32_t entry, uint64_t raw, int64_t t_ns)
+/* `t_ns`: when it was sampled; NULL: nobody knows. */
+static void take_value(struct decoder *d, const struct context *c, uint32_t entry, uint64_t raw, const int64_t *t_ns)
 {
 	struct canopen_value value = {.index = (uint16_t)(entry >> 16),
 	                              .sub = (uint8_t)(entry >> 8),
@@ -387,7 +403,8 @@ static void take_value(struct decoder *d, const struct context *c, uint32_t entr
 	const bool is_signed = value.index != 0x6004 || value.bits == 32;
 
 	if (is_angle(d, value.index) && value.sub == 0) {
-		take_angle(d, c, t_ns, is_signed ? signed_of(raw, value.bits) : (int64_t)raw);
+		if (t_ns)
+			take_angle(d, c, *t_ns, is_signed ? signed_of(raw, value.bits) : (int64_t)raw);
 	} else if (value.index == 0x6041 && value.bits == 16) {
 		const uint16_t statusword = (uint16_t)raw;
 
@@ -402,6 +419,7 @@ static void take_pdo(struct decoder *d, const struct context *c, const struct ca
 {
 	unsigned bits = 0, at = 0;
 	int64_t t_ns;
+	bool dated;
 
 	for (int i = 0; i < pdo->n; i++)
 		bits += pdo->entry[i] & 0xff;
@@ -413,12 +431,12 @@ static void take_pdo(struct decoder *d, const struct context *c, const struct ca
 		d->count[SHORT]++;
 		return;
 	}
-	t_ns = sampled_ns(d, c, pdo);
+	dated = sampled_ns(d, c, pdo, &t_ns);
 	for (int i = 0; i < pdo->n; i++) {
 		const unsigned n = pdo->entry[i] & 0xff;
 
 		if (n >= 1 && n <= 64)
-			take_value(d, c, pdo->entry[i], bits_at(c->f.data, at, n), t_ns);
+			take_value(d, c, pdo->entry[i], bits_at(c->f.data, at, n), dated ? &t_ns : NULL);
 		at += n;
 	}
 }
@@ -555,6 +573,8 @@ void canopen_decode(struct decoder *d, const struct record *record, const struct
 		can_bus_opened(&d->bus);
 		d->synced = d->echoed = d->written.set = false;
 		d->sync_gap_ns = 0;
+		for (int i = 0; i < PDOS; i++)
+			d->pdo[1][i].pairing = (struct canopen_pairing){0};
 		return;
 	}
 	if (record->t_ns < STATE_TIME_MIN || record->t_ns > STATE_TIME_MAX) {
@@ -606,6 +626,7 @@ static void pdo_state(struct state *s, struct pdo *pdo)
 	value_state(s, &pdo->count);
 	for (int i = 0; i < PDO_ENTRIES; i++)
 		value_state(s, &pdo->entry[i]);
+	canopen_pairing_state(s, &pdo->pairing);
 }
 
 static void fields_state(struct decoder *d, struct state *s)

@@ -46,6 +46,7 @@ void canopen_decoder_state(struct decoder *, struct state *);
 /* What the decoder learned, for tests and messages: PDO n (1..8) of the node. */
 struct canopen_learned {
 	bool known; /* the mapping is complete */
+	int number; /* from 0 */
 	uint32_t cob;
 	uint8_t type;
 	int n;

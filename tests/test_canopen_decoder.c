@@ -280,7 +280,7 @@ static void no_angle_goes_back_in_time(void **state)
 	bus(&b, 11, 0x185, "\x37\x16\x01\x00\x00\x00", 6);
 	bus(&b, 12, 0x185, "\x37\x16\x02\x00\x00\x00", 6);
 	assert_int_equal(b.tilts, 1);
-	assert_int_equal(counted(&b, "repeated"), 1);
+	assert_int_equal(counted(&b, "undated"), 1);
 	assert_int_equal(b.replies[CANOPEN_REPLY_STATUS], 2); /* the rest of it is news */
 	bus(&b, -5000, 0x080, "", 0);                         /* another time base */
 	bus(&b, -4999, 0x185, "\x37\x16\x02\x00\x00\x00", 6);

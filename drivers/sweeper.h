@@ -42,7 +42,8 @@ struct sweeper {
 	int64_t settle_ns;
 	double acceleration_rad_s2; /* 0: not known */
 	double following_rad;
-	int64_t pause_ns; /* without a look or an angle for so long, the servo may have stopped by its own supervision */
+	int64_t
+	    pause_ns; /* without a look or an angle for so long, the servo may have stopped by its own supervision */
 	bool config_limited;
 	double config_limit_rad[2]; /* of the configuration ... */
 	bool limited;

@@ -130,7 +130,9 @@ static void drive(struct run *run)
 	for (int i = 0; i < 240; i++) {
 		int64_t t = (int64_t)i * 2 * TURN_NS;
 		double tilt_rad = (i < 120 ? i : 240 - i) * 0.5 * TRIG_DEG - 25 * TRIG_DEG;
-		struct pose pose = {t, {i * 0.001, 0, 0}, quat_normalise((struct quat){1, 0, 0, i * 0.0002})};
+		struct pose pose = {.t_ns = t,
+		                    .position_m = {i * 0.001, 0, 0},
+		                    .rotation = quat_normalise((struct quat){1, 0, 0, i * 0.0002})};
 		sweep_tilt(run->sweep, &(struct tilt){t, tilt_rad});
 		sweep_pose(run->sweep, &pose);
 		p = (struct profile){.t_ns = t,

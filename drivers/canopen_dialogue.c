@@ -107,11 +107,17 @@ struct dialogue {
 	char lacks[120]; /* what it refused of its supervision */
 };
 
+/* Any scale is a user's right; what has no room is as far as there is. */
+static int32_t whole_of(double counts)
+{
+	const double whole = rint(counts);
+
+	return whole >= INT32_MAX ? INT32_MAX : whole <= INT32_MIN ? INT32_MIN : (int32_t)whole;
+}
+
 static int32_t count_of(const struct dialogue *d, double rad)
 {
-	const double count = rint(canopen_angle_count(&d->device, d->device.count.scale, rad));
-
-	return count >= INT32_MAX ? INT32_MAX : count <= INT32_MIN ? INT32_MIN : (int32_t)count;
+	return whole_of(canopen_angle_count(&d->device, d->device.count.scale, rad));
 }
 
 static uint32_t rate_of(const struct dialogue *d, double rad)
@@ -943,7 +949,7 @@ static void lead(struct dialogue *d, int64_t t_ns)
 	d->led[d->leds++ % LEDS].t_ns = t_ns + period_ns(d);
 	d->led[(d->leds - 1) % LEDS].rad = rad;
 	rad_s = rad_s > peak ? peak : rad_s < -peak ? -peak : rad_s;
-	canopen_drive_follow(&d->drive, (int32_t)rint(d->device.count.sign * rad_s / d->device.count.scale));
+	canopen_drive_follow(&d->drive, whole_of(d->device.count.sign * rad_s / d->device.count.scale));
 }
 
 static void command(struct dialogue *d, int64_t t_ns, struct dialogue_step *ret)

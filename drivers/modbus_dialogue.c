@@ -24,13 +24,14 @@
 
 #define ANSWER_NS  1000000000 /* a request is answered by then, or said again */
 #define TRIES_MAX  3
-#define BUSY_NS    50000000    /* who is busy is asked again so much later, ... */
-#define BUSY_MAX   40          /* ... so often */
-#define SILENCE_NS 3000000000  /* no angle for so long: given up */
-#define GAP_NS     500000000   /* a longer time without a look is no silence of the servo's */
-#define STATUS_NS  100000000   /* how often the status is read */
-#define CLEAR_NS   1000000000  /* a fault is gone so long after its reset, or stays */
-#define RESUME_NS  30000000000 /* between two set-ups because a fault went away */
+#define BUSY_NS    50000000     /* who is busy is asked again so much later, ... */
+#define BUSY_MAX   40           /* ... so often */
+#define SILENCE_NS 3000000000   /* no angle for so long: given up */
+#define GAP_NS     500000000    /* a longer time without a look is no silence of the servo's */
+#define STATUS_NS  100000000    /* how often the status is read */
+#define CLEAR_NS   1000000000   /* a fault is gone so long after its reset, or stays */
+#define RESUME_NS  30000000000  /* between two set-ups because a fault went away */
+#define FORGIVE_NS 600000000000 /* who ran well for so long may be reset again */
 
 enum phase { SEQUENCE, CLEARING, RUNNING, HALTED, STOPPING, STOPPED, FAILED };
 enum wish {
@@ -164,6 +165,9 @@ static bool sweeper_is_halted(struct dialogue *d, int64_t t_ns)
 static void fault(struct dialogue *d, uint16_t status, int64_t t_ns)
 {
 	bool sets_up = d->phase == SEQUENCE && d->sequence.list == &d->device.write;
+
+	if (d->phase == RUNNING && t_ns - d->begun_ns >= FORGIVE_NS)
+		d->reset_used = false;
 	bool resets = d->device.reset.n > 0 && !d->reset_used &&
 	              ((d->phase == RUNNING && !sweeper_is_halted(d, t_ns)) || sets_up);
 	char what[80];

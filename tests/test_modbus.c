@@ -31,6 +31,36 @@ static void all_four_orders_give_the_same_number(void **state)
 	}
 }
 
+/* 0xc0490fdb is -3.14159274 as a float, 3226013659 unsigned, -1068953637 signed; 0xc049 alone 49225 and -16311. */
+static void every_type_reads_its_bytes_in_every_order(void **state)
+{
+	static const uint16_t wide[4][2] = {{0xc049, 0x0fdb}, {0x0fdb, 0xc049}, {0x49c0, 0xdb0f}, {0xdb0f, 0x49c0}};
+	static const uint16_t narrow[4] = {0xc049, 0xc049, 0x49c0, 0x49c0};
+	static const struct {
+		int type;
+		double value;
+	} of[] = {{REGISTER_I16, -16311},
+	          {REGISTER_U16, 49225},
+	          {REGISTER_I32, -1068953637},
+	          {REGISTER_U32, 3226013659},
+	          {REGISTER_F32, -3.1415927410125732}};
+
+	(void)state;
+	for (size_t i = 0; i < sizeof of / sizeof *of; i++)
+		for (int order = ORDER_ABCD; order <= ORDER_DCBA; order++) {
+			struct config_register r = {.type = of[i].type, .order = order, .scale = 1.0, .sign = 1};
+			const int n = modbus_wire_registers(&r);
+			const uint16_t *raw = n == 1 ? &narrow[order] : wide[order];
+			uint16_t back[2];
+			double v;
+
+			assert_int_equal(modbus_wire_decode(&r, raw, &v), 0);
+			assert_true(v == of[i].value);
+			assert_int_equal(modbus_wire_encode(&r, v, back), 0);
+			assert_memory_equal(back, raw, (size_t)n * sizeof *raw);
+		}
+}
+
 static void every_type_goes_there_and_back_at_its_limits(void **state)
 {
 	static const struct {
@@ -289,10 +319,58 @@ static void foreign_refused_and_absurd_records_are_counted_not_decoded(void **st
 	driver_modbus.decoder_destroy(decoder);
 }
 
+/* What its dialogue asks for: a status, a step that waits. Nobody else's register is an angle or an answer. */
+static void one_register_is_read_for_the_dialogue_beside_the_angle(void **state)
+{
+	struct config config = servo_config();
+	struct config_device *d = &config.device[0];
+	struct modbus_transaction t = angle_of(MS, MS, 0);
+	struct seen seen = {0};
+	struct decoder *decoder;
+
+	(void)state;
+	d->status.set = true;
+	d->status.function = 4;
+	d->status.address = 17;
+	d->reset.n = 1;
+	d->reset.item[0].until.set = true;
+	d->reset.item[0].until.address = 6;
+	decoder = driver_modbus.decoder_create(d, 0);
+	t.n = 1;
+	t.function = 4;
+	t.address = 17;
+	feed(decoder, &t, &seen);
+	t.function = 3;
+	t.address = 6;
+	feed(decoder, &t, &seen);
+	assert_int_equal(counter(decoder, "reads"), 2);
+	assert_int_equal(seen.replies, 2);
+	assert_int_equal(seen.kind, MODBUS_READ);
+	t.function = 4; /* a holding register is no input register */
+	feed(decoder, &t, &seen);
+	t.function = 3;
+	t.n = 2;
+	feed(decoder, &t, &seen);
+	assert_int_equal(counter(decoder, "foreign"), 2);
+	assert_int_equal(seen.replies, 2);
+	driver_modbus.decoder_destroy(decoder);
+	d->position.type = REGISTER_I16; /* a register may be the angle and be waited for */
+	d->position.address = 6;
+	decoder = driver_modbus.decoder_create(d, 0);
+	t.n = 1;
+	seen = (struct seen){0};
+	feed(decoder, &t, &seen);
+	assert_int_equal(seen.tilts, 1);
+	assert_int_equal(seen.replies, 2);
+	assert_int_equal(seen.kind, MODBUS_READ);
+	driver_modbus.decoder_destroy(decoder);
+}
+
 int main(void)
 {
 	const struct CMUnitTest tests[] = {
 	    cmocka_unit_test(all_four_orders_give_the_same_number),
+	    cmocka_unit_test(every_type_reads_its_bytes_in_every_order),
 	    cmocka_unit_test(every_type_goes_there_and_back_at_its_limits),
 	    cmocka_unit_test(scale_zero_and_sign_are_applied_as_documented),
 	    cmocka_unit_test(a_float_that_is_no_number_is_refused),
@@ -302,6 +380,7 @@ int main(void)
 	    cmocka_unit_test(a_slow_round_trip_is_refused_and_a_slower_bus_is_followed),
 	    cmocka_unit_test(a_slow_answer_of_a_servo_that_stands_is_taken),
 	    cmocka_unit_test(round_trips_tell_the_jitter_and_the_period_the_rate),
+	    cmocka_unit_test(one_register_is_read_for_the_dialogue_beside_the_angle),
 	    cmocka_unit_test(foreign_refused_and_absurd_records_are_counted_not_decoded),
 	};
 

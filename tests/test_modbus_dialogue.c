@@ -518,6 +518,23 @@ static void a_fault_is_reset_once_and_the_second_one_halts(void **state)
 	tear_down();
 }
 
+static void a_drive_that_ran_well_for_ten_minutes_may_be_reset_again(void **state)
+{
+	struct config config = strict_config();
+
+	(void)state;
+	set_up(&config, &strict);
+	run(3.0);
+	for (int i = 1; i <= 3; i++) {
+		order("fault", 0.0, true);
+		order("fault", 0.0, false);
+		run(2.0);
+		assert_int_equal(bed.resets, i);
+		assert_sweeps(620.0);
+	}
+	tear_down();
+}
+
 static void a_fault_that_stays_is_reported_once_and_never_reset_again(void **state)
 {
 	struct config config = strict_config();
@@ -773,6 +790,7 @@ int main(void)
 	    cmocka_unit_test(a_drive_stands_within_its_time_when_facetd_dies),
 	    cmocka_unit_test(a_drive_that_its_watchdog_stopped_sweeps_again_when_facetd_is_back),
 	    cmocka_unit_test(a_fault_is_reset_once_and_the_second_one_halts),
+	    cmocka_unit_test(a_drive_that_ran_well_for_ten_minutes_may_be_reset_again),
 	    cmocka_unit_test(a_fault_that_stays_is_reported_once_and_never_reset_again),
 	    cmocka_unit_test(a_fault_without_a_reset_halts_until_it_is_cleared),
 	    cmocka_unit_test(a_fault_that_flickers_is_answered_rarely),

@@ -6,12 +6,13 @@
  *      └── 0080 after 0000 ── fault ◄── fault reaction ◄── any
  *
  * A command is decided by the state that the drive shows, never by what was sent last, and is repeated while it shows no
- * effect: a frame that got lost costs a tenth of a second. What is repeated is the same frame, so bit 7 (fault reset) and
- * bit 4 (new set-point) have one rising edge however often they are sent.
+ * effect: a frame that got lost costs a tenth of a second. What is repeated is the same frame, so bit 7 (fault reset) has
+ * one rising edge however often it is sent.
  *
  * A drive that is found enabled is made to stand before anything of it is changed. 607A is what 6064 says until it runs,
  * or a drive in mode cyclic would jump. Mode position: target and bit 4 go in two frames, because many drives apply the
- * objects of a PDO in their order, and 6040 comes first; bit 5 (at once) only while it is still on its way.
+ * objects of a PDO in their order, and 6040 comes first; both are repeated while it does not acknowledge. Bit 5 (at once)
+ * is set only while it is still on its way.
  *
  * A fault is reset once. It may be reset again when it was gone for ten minutes of running, or the drive was switched off
  * and on, or somebody else has reset it: a drive that trips at every sweep is reported, not driven on. Faults of the
@@ -512,10 +513,19 @@ static void home(struct canopen_drive *d, int64_t t_ns)
 
 static void put(struct canopen_drive_wish *ret, uint16_t control, int32_t demand)
 {
-	if (ret->frames == 2)
+	if (ret->frames == CANOPEN_DRIVE_FRAMES)
 		return;
 	ret->frame[ret->frames].control = control;
 	ret->frame[ret->frames++].demand = demand;
+}
+
+/* The target first, then the edge. */
+static void put_set_point(struct canopen_drive *d, int64_t t_ns, struct canopen_drive_wish *ret)
+{
+	put(ret, CONTROL_ENABLE, d->demand);
+	put(ret, d->control, d->demand);
+	d->send = false;
+	d->due_ns = t_ns + CANOPEN_DRIVE_REPEAT_NS;
 }
 
 static void raise_set_point(struct canopen_drive *d, int64_t t_ns, struct canopen_drive_wish *ret)
@@ -524,12 +534,9 @@ static void raise_set_point(struct canopen_drive *d, int64_t t_ns, struct canope
 	d->goes = false;
 	d->moves = true;
 	d->control = CONTROL_ENABLE | CONTROL_BEGIN | (d->status & STATUS_REACHED ? 0 : CONTROL_AT_ONCE);
-	put(ret, CONTROL_ENABLE, d->demand);
-	put(ret, d->control, d->demand);
-	d->send = false;
 	d->handshake = SET_POINT_RAISED;
 	d->step_ns = t_ns;
-	d->due_ns = t_ns + CANOPEN_DRIVE_REPEAT_NS;
+	put_set_point(d, t_ns, ret);
 }
 
 static void shake_hands(struct canopen_drive *d, int64_t t_ns, struct canopen_drive_wish *ret)
@@ -548,8 +555,8 @@ static void shake_hands(struct canopen_drive *d, int64_t t_ns, struct canopen_dr
 			d->handshake = SET_POINT_LOWERED;
 			d->step_ns = t_ns;
 			command(d, CONTROL_ENABLE, t_ns);
-		} else {
-			command(d, d->control, t_ns);
+		} else if (t_ns >= d->due_ns) {
+			put_set_point(d, t_ns, ret); /* both were lost, or the one with the target was */
 		}
 		break;
 	case SET_POINT_LOWERED:

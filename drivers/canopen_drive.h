@@ -13,6 +13,7 @@
 #include "config/config.h"
 #include "drivers/canopen_wire.h"
 
+#define CANOPEN_DRIVE_FRAMES     3                     /* of one step: a target, its edge, and a halt */
 #define CANOPEN_DRIVE_STEP_NS    INT64_C(1000000000)   /* for each transition, and each answer to a command */
 #define CANOPEN_DRIVE_ENABLE_NS  INT64_C(3000000000)   /* for the last one: brakes open, motors find their phases */
 #define CANOPEN_DRIVE_REPEAT_NS  INT64_C(100000000)    /* a command that shows no effect is sent again */
@@ -51,7 +52,7 @@ struct canopen_drive_wish {
 	struct {
 		uint16_t control;
 		int32_t demand; /* counts, in mode velocity counts/s */
-	} frame[2];
+	} frame[CANOPEN_DRIVE_FRAMES];
 	bool asks; /* this transfer is wanted, until canopen_drive_answer */
 	struct {
 		bool download;

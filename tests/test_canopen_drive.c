@@ -27,6 +27,7 @@ struct plant {
 	enum canopen_drive_state stays; /* does not leave this state by command */
 	uint16_t extra;                 /* bits of its statusword: following error, limit ... */
 	uint16_t lacks;                 /* bits that are missing: voltage, remote */
+	int stale;                      /* statuswords that still tell of the homing before */
 	bool incurable, homing_fails, homing_hangs, mode_hangs, other_sign, no_ack, keeps_ack;
 	uint16_t refuses; /* this object */
 	uint32_t modes;   /* 6502 */
@@ -37,7 +38,9 @@ struct plant {
 
 	/* What it saw. */
 	int resets, set_points, quick_stops, jumps, control_frames;
-	int32_t highest, lowest;
+	int hasty;     /* set-points before the acknowledgement of the last one was taken back */
+	int at_once;   /* ... told to be done at once */
+	int32_t taken; /* the target as it was known when bit 4 rose */
 };
 
 static struct plant plant(enum canopen_drive_state state)
@@ -48,9 +51,7 @@ static struct plant plant(enum canopen_drive_state state)
 	                      .stays = CANOPEN_DRIVE_UNKNOWN,
 	                      .modes = 0xa5,
 	                      .code = 0x4310,
-	                      .reached = true,
-	                      .highest = INT32_MIN,
-	                      .lowest = INT32_MAX};
+	                      .reached = true};
 }
 
 static uint16_t statusword(const struct plant *p)
@@ -92,10 +93,11 @@ static enum canopen_drive_state commanded(const struct plant *p, uint16_t contro
 
 static void take_set_point(struct plant *p, bool rises)
 {
+	p->hasty += rises && p->ack;
 	if (rises && !p->no_ack && !p->ack) {
 		p->set_points++;
-		p->highest = p->target > p->highest ? p->target : p->highest;
-		p->lowest = p->target < p->lowest ? p->target : p->lowest;
+		p->at_once += (p->control & 0x20) != 0;
+		p->taken = p->target; /* objects are applied in their order: 6040 comes before 607A */
 		p->ack = true;
 		p->reached = false;
 	}
@@ -129,8 +131,9 @@ static void take_frame(struct plant *p, uint16_t control, int32_t demand)
 		p->jumps += demand != 0;
 	if (p->mode == 6 && rises && p->state == CANOPEN_ENABLED && !p->homing_hangs) {
 		p->homing = true;
-		p->attained = !p->homing_fails;
-		p->position = p->attained ? p->other_sign ? -p->homed_at : p->homed_at : p->position;
+		p->attained = !p->homing_fails && p->stale == 0;
+		if (p->stale == 0 && !p->homing_fails)
+			p->position = p->other_sign ? -p->homed_at : p->homed_at;
 	}
 }
 
@@ -143,7 +146,8 @@ static bool serve(struct plant *p, const struct canopen_drive_wish *w, uint32_t 
 	switch (w->ask.index) {
 	case 0x6060:
 		p->mode = p->mode_hangs ? p->mode : (int)w->ask.value;
-		p->attained = p->homing = false;
+		p->attained = p->stale > 0;
+		p->homing = false;
 		break;
 	case 0x6061:
 		*ret = (uint32_t)p->mode;
@@ -169,6 +173,19 @@ static bool serve(struct plant *p, const struct canopen_drive_wish *w, uint32_t 
 	return true;
 }
 
+/* A homing that begins late: bits of the one before stand for a while, then it is under way, then it is done. */
+static void be_slow(struct plant *p)
+{
+	if (!p->homing || p->stale == 0)
+		return;
+	p->stale--;
+	p->attained = p->stale > 4;
+	if (p->stale == 0) {
+		p->attained = true;
+		p->position = p->homed_at;
+	}
+}
+
 /* A status every 10 ms, an answer in the next step: so long. */
 static void run(struct canopen_drive *d, struct plant *p, int64_t *t_ns, int64_t ms)
 {
@@ -177,6 +194,7 @@ static void run(struct canopen_drive *d, struct plant *p, int64_t *t_ns, int64_t
 
 	for (int64_t end_ns = *t_ns + ms * MS; *t_ns < end_ns; *t_ns += 5 * MS) {
 		if (*t_ns / MS % 10 == 0) {
+			be_slow(p);
 			canopen_drive_status(d, statusword(p), *t_ns);
 			canopen_drive_position(d, p->position);
 			canopen_drive_follow(d, d->setup.mode == CANOPEN_VELOCITY ? 0 : d->demand);
@@ -374,6 +392,41 @@ static void a_fault_is_reset_by_one_edge_and_then_reported(void **state)
 	assert_int_equal(d.phase, CANOPEN_DRIVE_RUNNING);
 }
 
+static void bit_7_is_low_before_it_rises(void **state)
+{
+	struct plant p = plant(CANOPEN_FAULT);
+	struct canopen_drive d = drive(CANOPEN_POSITION);
+	int64_t t_ns = 0;
+
+	(void)state;
+	p.control = 0x80; /* somebody left it so */
+	canopen_drive_begin(&d, t_ns);
+	run(&d, &p, &t_ns, 1000);
+	assert_int_equal(p.resets, 1);
+	assert_int_equal(d.phase, CANOPEN_DRIVE_RUNNING);
+}
+
+static void a_fault_while_it_stands_and_its_cure_let_it_go_on(void **state)
+{
+	struct plant p = plant(CANOPEN_SWITCH_ON_DISABLED);
+	struct canopen_drive d = drive(CANOPEN_POSITION);
+	int64_t t_ns = 0;
+
+	(void)state;
+	canopen_drive_begin(&d, t_ns);
+	run(&d, &p, &t_ns, 500);
+	canopen_drive_halt(&d, "is 12 degrees off", t_ns);
+	run(&d, &p, &t_ns, 1000);
+	assert_string_equal(d.why, "is 12 degrees off");
+	p.state = CANOPEN_FAULT;
+	run(&d, &p, &t_ns, 5000);
+	assert_int_equal(d.phase, CANOPEN_DRIVE_STANDING);
+	assert_int_equal(p.resets, 0); /* whoever stands does not need it */
+	p.state = CANOPEN_SWITCH_ON_DISABLED;
+	run(&d, &p, &t_ns, 1000);
+	assert_int_equal(d.phase, CANOPEN_DRIVE_RUNNING);
+}
+
 static void a_fault_that_does_not_clear_is_reported(void **state)
 {
 	struct plant p = plant(CANOPEN_FAULT);
@@ -473,12 +526,14 @@ static void a_target_goes_by_its_handshake(void **state)
 	for (int i = 0; i < 10; i++) {
 		canopen_drive_speed(&d, 1000 + (uint32_t)i);
 		assert_true(canopen_drive_goto(&d, i * 1000));
-		p.lose = i % 4;
+		p.lose = i % 3 * 2; /* both frames: they leave together */
 		run(&d, &p, &t_ns, 600);
 		assert_int_equal(p.set_points, i + 1);
 		assert_int_equal(d.taken, i + 1);
 		assert_int_equal(d.taken_count, i * 1000);
-		assert_int_equal(p.target, i * 1000);
+		assert_int_equal(p.taken, i * 1000);
+		assert_int_equal(p.hasty, 0);
+		assert_int_equal(p.at_once, 0); /* it had reached the last one */
 		assert_int_equal(p.speed, 1000 + i);
 		assert_false(p.ack);
 		assert_int_equal(p.control, 0x0f);
@@ -500,12 +555,15 @@ static void a_target_that_changes_at_once_is_taken_at_once(void **state)
 	canopen_drive_goto(&d, 2); /* the first is still shaking hands */
 	run(&d, &p, &t_ns, 200);
 	assert_int_equal(p.set_points, 2);
-	assert_int_equal(p.target, 2);
+	assert_int_equal(p.taken, 2);
+	assert_int_equal(p.hasty, 0);
+	assert_int_equal(p.at_once, 1);
 	/* A new speed reaches a drive that is on its way. */
 	canopen_drive_speed(&d, 500);
 	run(&d, &p, &t_ns, 200);
 	assert_int_equal(p.set_points, 3);
-	assert_int_equal(p.target, 2);
+	assert_int_equal(p.taken, 2);
+	assert_int_equal(p.at_once, 2);
 }
 
 static void a_handshake_that_fails_has_its_sentence(void **state)
@@ -627,6 +685,22 @@ static void homing_ends_in_the_mode_that_was_wanted(void **state)
 	}
 }
 
+static void bits_of_the_homing_before_count_for_nothing(void **state)
+{
+	(void)state;
+	for (int stale = 5; stale <= 8; stale++) { /* the old bits for up to 40 ms */
+		struct plant p = plant(CANOPEN_SWITCH_ON_DISABLED);
+		struct canopen_drive d = homing_drive(CANOPEN_POSITION, 250);
+		int64_t t_ns = 0;
+
+		p.stale = stale;
+		canopen_drive_begin(&d, t_ns);
+		run(&d, &p, &t_ns, 1000);
+		assert_int_equal(d.phase, CANOPEN_DRIVE_RUNNING);
+		assert_int_equal(p.position, 250);
+	}
+}
+
 static void homing_that_fails_is_said_and_not_repeated(void **state)
 {
 	(void)state;
@@ -744,6 +818,8 @@ int main(void)
 	    cmocka_unit_test(a_step_that_is_not_taken_has_its_sentence),
 	    cmocka_unit_test(a_drive_without_a_statusword_is_named),
 	    cmocka_unit_test(a_fault_is_reset_by_one_edge_and_then_reported),
+	    cmocka_unit_test(bit_7_is_low_before_it_rises),
+	    cmocka_unit_test(a_fault_while_it_stands_and_its_cure_let_it_go_on),
 	    cmocka_unit_test(a_fault_that_does_not_clear_is_reported),
 	    cmocka_unit_test(ten_minutes_without_a_fault_earn_another_reset),
 	    cmocka_unit_test(what_was_our_own_silence_is_reset_at_once_but_not_for_ever),
@@ -755,6 +831,7 @@ int main(void)
 	    cmocka_unit_test(limits_that_are_none_are_none),
 	    cmocka_unit_test(a_following_error_or_a_limit_stops_the_sweep),
 	    cmocka_unit_test(homing_ends_in_the_mode_that_was_wanted),
+	    cmocka_unit_test(bits_of_the_homing_before_count_for_nothing),
 	    cmocka_unit_test(homing_that_fails_is_said_and_not_repeated),
 	    cmocka_unit_test(a_home_offset_of_the_other_sign_is_noticed),
 	    cmocka_unit_test(what_it_refuses_is_said_in_words),

@@ -5,6 +5,7 @@
 #include "drivers/can_bus.h"
 
 #include <stdio.h>
+#include <string.h>
 
 #define OVERFLOWS 0x03
 #define WARNINGS  0x0C
@@ -80,6 +81,8 @@ void can_bus_sentence(enum can_bus_health health, const char *interface, char re
 	else if (health == CAN_BUS_PASSIVE)
 		snprintf(ret, 160, "%.30s: error passive, frames fail; is anybody else there? If so, %s", interface,
 		         check);
+	else if (health == CAN_BUS_OFF && strncmp(interface, "unix:", 5) == 0) /* no interface of this machine */
+		snprintf(ret, 160, "%.60s: bus-off: %s", interface, check);
 	else if (health == CAN_BUS_OFF)
 		snprintf(ret, 160, "%.15s: bus-off: %s; `ip link set %.15s type can restart` starts it again",
 		         interface, check, interface);

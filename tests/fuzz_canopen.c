@@ -95,6 +95,15 @@ static void take_reply(void *ctx, int device, const struct reply *reply)
 	}
 }
 
+static void decode(struct bed *b, enum direction direction, const uint8_t *bytes, size_t len)
+{
+	const struct record_sink sink = {.ctx = b, .tilt = take_tilt, .reply = take_reply};
+	const struct record record = {
+	    .log_ns = b->t_ns, .t_ns = b->t_ns, .direction = direction, .bytes = bytes, .len = len};
+
+	driver_canopen.decode(b->decoder, &record, &sink);
+}
+
 /* What they want to send comes to an end. */
 static void step(struct bed *b)
 {
@@ -105,6 +114,7 @@ static void step(struct bed *b)
 	driver_canopen.dialogue_step(b->dialogue, b->t_ns, &wish);
 	must(wish.write_len <= sizeof wish.write && wish.write_len % CAN_WIRE_ENTRY == 0);
 	must(strlen(wish.error) < sizeof wish.error);
+	decode(b, TO_DEVICE, wish.write, wish.write_len);
 	for (size_t at = 0; at < wish.write_len; at += CAN_WIRE_ENTRY) {
 		must(can_wire_get(wish.write + at, CAN_WIRE_ENTRY, &f) == CAN_WIRE_ENTRY);
 		if (f.id == CANOPEN_SDO_REQUEST + NODE)
@@ -138,11 +148,7 @@ static struct can_frame_at answer_of(const struct can_frame_at *asked, const uin
 
 static void feed(struct bed *b, enum direction direction, const uint8_t *bytes, size_t len)
 {
-	const struct record_sink sink = {.ctx = b, .tilt = take_tilt, .reply = take_reply};
-	const struct record record = {
-	    .log_ns = b->t_ns, .t_ns = b->t_ns, .direction = direction, .bytes = bytes, .len = len};
-
-	driver_canopen.decode(b->decoder, &record, &sink);
+	decode(b, direction, bytes, len);
 	step(b);
 }
 

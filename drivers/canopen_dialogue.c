@@ -37,6 +37,7 @@
 #define START_NS       (500 * MS)   /* NMT start is said again */
 #define STARTING_NS    (3000 * MS)  /* an angle has come by then */
 #define BOOT_NS        (2000 * MS)  /* the boot-up after a reset */
+#define AGAIN_NS       (500 * MS)   /* between two tries that are not told */
 #define BEATS          3            /* heartbeats that may be missing, on either side */
 #define SAID_NS        (60000 * MS) /* the same failure is told by leaving the link no sooner */
 #define EMCY_NS        (60000 * MS) /* an emergency that is never taken back is forgotten */
@@ -240,6 +241,7 @@ static void give_up(struct dialogue *d, const char *why, int64_t t_ns)
 	if (told && d->device.sync_ns > 0) {
 		again(d, why, t_ns);
 		enter(d, RESETTING, t_ns);
+		d->stage_ns = t_ns + AGAIN_NS - BOOT_NS; /* sooner */
 		return;
 	}
 	snprintf(d->why, sizeof d->why, "%s", why);
@@ -404,6 +406,12 @@ static void unanswered(struct dialogue *d, int64_t t_ns, struct dialogue_step *r
 {
 	char text[160] = "";
 
+	/* Through a bus that is known to be broken nobody is woken. */
+	if (d->health >= CAN_BUS_PASSIVE) {
+		can_bus_sentence(d->health, d->device.connect, text);
+		give_up(d, text, t_ns);
+		return;
+	}
 	/* A drive that only somebody else commands, and one that says it is operational, are not woken. */
 	if (d->wakes == 0 && d->nmt != CANOPEN_OPERATIONAL && (d->commands || d->device.kind != CANOPEN_DRIVE)) {
 		put_nmt(d, CANOPEN_ENTER_PREOPERATIONAL, ret);
@@ -610,6 +618,12 @@ static void list_listening(struct dialogue *d)
 		        has_sync(d) ? 1 : TYPE_EVENT, entry, 0);
 }
 
+/* 1016: an eighth of a period beyond, or a beat that is a little late after two that were lost would be the third. */
+static uint32_t missing_ms(const struct dialogue *d)
+{
+	return BEATS * d->beat_ms + d->beat_ms / 8;
+}
+
 /* One that is commanded. */
 static void list_commanding(struct dialogue *d)
 {
@@ -620,7 +634,7 @@ static void list_commanding(struct dialogue *d)
 
 	d->beat_ms = (uint32_t)(d->device.heartbeat_ns / MS);
 	canopen_setup_init(&d->setup, d->device.node);
-	canopen_setup_heartbeat(&d->setup, (uint16_t)d->beat_ms, d->device.master, (uint16_t)(BEATS * d->beat_ms));
+	canopen_setup_heartbeat(&d->setup, (uint16_t)d->beat_ms, d->device.master, (uint16_t)missing_ms(d));
 	canopen_setup_object(&d->setup, &stop[0]);
 	canopen_setup_object(&d->setup, &stop[1]);
 	if (d->device.homing.set) {

@@ -106,7 +106,7 @@ static inline void peer_parse(struct peer *p)
 		if (good && tcp)
 			peer_serve(p, p->buf, 6, p->buf[6], p->buf + 7);
 		else if (good)
-			peer_serve(p, NULL, 0, p->buf[0], p->buf + 1);
+			peer_serve(p, p->buf, 0, p->buf[0], p->buf + 1);
 		n = good ? n : 1;
 		p->len -= n;
 		memmove(p->buf, p->buf + n, p->len);

@@ -545,8 +545,15 @@ static void shake_hands(struct canopen_drive *d, int64_t t_ns, struct canopen_dr
 
 	switch (d->handshake) {
 	case SET_POINT_NONE:
-		if (d->goes && !ack && !d->speed_due)
+		if (!d->goes || d->speed_due)
+			break;
+		if (ack) { /* nobody's, or what homing made of this bit: it has to go first */
+			d->handshake = SET_POINT_LOWERED;
+			d->step_ns = t_ns;
+			command(d, CONTROL_ENABLE, t_ns);
+		} else {
 			raise_set_point(d, t_ns, ret);
+		}
 		break;
 	case SET_POINT_RAISED:
 		if (ack) {
@@ -571,7 +578,7 @@ static void shake_hands(struct canopen_drive *d, int64_t t_ns, struct canopen_dr
 		      d->handshake == SET_POINT_RAISED ? "does not acknowledge its target"
 		                                       : "does not take its acknowledgement back",
 		      d->status);
-	else if (d->handshake == SET_POINT_NONE && d->goes && !d->speed_due)
+	else if (d->handshake == SET_POINT_NONE && d->goes && !d->speed_due) /* the bit has gone */
 		shake_hands(d, t_ns, ret);
 }
 

@@ -586,6 +586,32 @@ static void a_handshake_that_fails_has_its_sentence(void **state)
 	}
 }
 
+/* Bit 12 is set before anything was told: another's set-point, or what another mode made of it. */
+static void an_acknowledgement_of_nothing_has_to_go_first(void **state)
+{
+	(void)state;
+	for (int goes = 0; goes < 2; goes++) {
+		struct plant p = plant(CANOPEN_SWITCH_ON_DISABLED);
+		struct canopen_drive d = drive(CANOPEN_POSITION);
+		int64_t t_ns = 0;
+
+		canopen_drive_begin(&d, t_ns);
+		run(&d, &p, &t_ns, 500);
+		p.extra = 0x1000;
+		run(&d, &p, &t_ns, 100);
+		canopen_drive_goto(&d, 5);
+		run(&d, &p, &t_ns, 100);
+		assert_int_equal(d.phase, CANOPEN_DRIVE_RUNNING);
+		assert_int_equal(p.set_points, 0);
+		p.extra = goes ? 0 : 0x1000;
+		run(&d, &p, &t_ns, 1500);
+		assert_int_equal(p.set_points, goes);
+		assert_int_equal(d.phase, goes ? CANOPEN_DRIVE_RUNNING : CANOPEN_DRIVE_STANDING);
+		if (!goes)
+			assert_non_null(strstr(d.why, "does not take its acknowledgement back"));
+	}
+}
+
 static void nothing_beyond_its_own_limits_is_sent(void **state)
 {
 	(void)state;
@@ -827,6 +853,7 @@ int main(void)
 	    cmocka_unit_test(a_target_goes_by_its_handshake),
 	    cmocka_unit_test(a_target_that_changes_at_once_is_taken_at_once),
 	    cmocka_unit_test(a_handshake_that_fails_has_its_sentence),
+	    cmocka_unit_test(an_acknowledgement_of_nothing_has_to_go_first),
 	    cmocka_unit_test(nothing_beyond_its_own_limits_is_sent),
 	    cmocka_unit_test(limits_that_are_none_are_none),
 	    cmocka_unit_test(a_following_error_or_a_limit_stops_the_sweep),

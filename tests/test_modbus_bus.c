@@ -374,61 +374,58 @@ static int next_answer(struct link *link, int unit, struct modbus_transaction *r
 	return 0;
 }
 
-static void a_late_answer_on_a_line_is_never_taken_for_the_next_one(void **state)
+/* Five answers; each was made after the late one and after the one before. A machine that is busy elsewhere may make more
+ * of them late, and whoever is lost is opened again, as the supervisor does. */
+static void take_later_answers(struct link **link, const struct config_device *device, int late)
 {
 	struct modbus_transaction t;
-	struct config_device device;
-	struct link *link;
-	struct peer peer;
 	char error[160];
+	int last = late;
 
-	(void)state;
-	peer_start(&peer, false);
-	device = unit_of(&peer, 1);
-	peer.late_ms[1] = 700; /* later than the driver's 500 ms */
-	link = driver_modbus.link_open(&device, error);
-	assert_int_equal(next_answer(link, 1, &t), 0);
-	assert_int_equal(t.function, 3 | MODBUS_WIRE_REFUSED);
-	assert_int_equal(t.value[0], 0);
-	for (int i = 1; i < 5; i++) { /* the answer numbered 0 is never seen */
-		assert_int_equal(next_answer(link, 1, &t), 0);
-		assert_int_equal(t.function, 3);
-		assert_int_equal(t.value[1], i);
+	for (int good = 0; good < 5;) {
+		if (next_answer(*link, device->slave, &t) < 0) {
+			driver_modbus.link_close(*link);
+			*link = driver_modbus.link_open(device, error);
+			assert_non_null(*link);
+		} else if (t.function == 3) {
+			assert_true(t.value[1] > last);
+			last = t.value[1];
+			good++;
+		}
 	}
-	driver_modbus.link_close(link);
-	peer_end(&peer);
 }
 
-static void a_late_answer_over_tcp_ends_the_connection(void **state)
+static void a_late_answer_is_never_taken_for_the_next_one(void **state)
 {
+	static struct peer peer; /* outlives a failed test */
 	struct modbus_transaction t;
 	struct config_device device;
 	struct link *link;
-	struct peer peer;
 	char error[160];
 
 	(void)state;
-	peer_start(&peer, true);
-	device = unit_of(&peer, 1);
-	for (int i = 0; i < 3; i++) {
-		const int asked = peer.requests[1];
+	for (int tcp = 0; tcp < 2; tcp++) {
+		peer_start(&peer, tcp);
+		device = unit_of(&peer, 1);
+		for (int i = 0; i < 3; i++) {
+			peer.late_ms[1] = 700; /* later than the driver's 500 ms */
+			const int late = peer.requests[1];
 
-		peer.late_ms[1] = 700;
-		link = driver_modbus.link_open(&device, error);
-		assert_int_equal(next_answer(link, 1, &t), 0);
-		assert_int_equal(t.function, 3 | MODBUS_WIRE_REFUSED);
-		assert_int_equal(next_answer(link, 1, &t), -ETIMEDOUT);
-		driver_modbus.link_close(link);
-		link = driver_modbus.link_open(&device, error); /* as the supervisor does */
-		for (int k = 1; k < 5; k++) {
+			link = driver_modbus.link_open(&device, error);
+			assert_non_null(link);
 			assert_int_equal(next_answer(link, 1, &t), 0);
-			assert_int_equal(t.function, 3);
-			assert_int_equal(t.value[1], asked + k);
+			assert_int_equal(t.function, 3 | MODBUS_WIRE_REFUSED);
+			assert_int_equal(t.value[0], 0);
+			if (tcp) /* its numbers could be mixed up no more, but libmodbus cannot go on */
+				assert_int_equal(next_answer(link, 1, &t), -ETIMEDOUT);
+			take_later_answers(&link, &device, late);
+			driver_modbus.link_close(link);
+			/* It may have been asked once more; that answer is nobody's. */
+			for (int seen = -1; seen != peer.requests[1]; usleep(100000))
+				seen = peer.requests[1];
 		}
-		driver_modbus.link_close(link);
+		peer_end(&peer);
 	}
-	assert_int_equal(peer.connections, 6);
-	peer_end(&peer);
 }
 
 /* ---- several devices on one bus ---- */
@@ -512,7 +509,7 @@ static void two_devices_share_a_bus_and_are_polled_alike(void **state)
 		bool undisturbed = false;
 
 		for (int tries = 0; tries < 20 && !undisturbed; tries++) {
-			struct shared s;
+			static struct shared s; /* outlives a failed test */
 
 			share_bus(&s, tcp);
 			read_both(&s, 100);
@@ -529,7 +526,7 @@ static void an_absent_device_costs_the_other_a_tenth_of_a_second_each_second(voi
 {
 	(void)state;
 	for (int tcp = 0; tcp < 2; tcp++) {
-		struct shared s;
+		static struct shared s;
 		int64_t begun_ns;
 
 		share_bus(&s, tcp);
@@ -556,7 +553,7 @@ static void closing_one_device_leaves_the_other(void **state)
 	for (int tcp = 0; tcp < 2; tcp++)
 		for (int gone = 1; gone <= 2; gone++) {
 			const int other = 3 - gone;
-			struct shared s;
+			static struct shared s; /* outlives a failed test */
 			char error[160];
 
 			share_bus(&s, tcp);
@@ -582,7 +579,7 @@ static void closing_one_device_leaves_the_other(void **state)
 /* next_answer looks whose value it is. */
 static void a_late_answer_on_a_shared_line_is_nobody_elses(void **state)
 {
-	struct shared s;
+	static struct shared s;
 
 	(void)state;
 	share_bus(&s, false);
@@ -596,7 +593,7 @@ static void a_late_answer_on_a_shared_line_is_nobody_elses(void **state)
 
 static void a_bus_that_is_lost_is_lost_for_all_and_comes_back_for_all(void **state)
 {
-	struct shared s;
+	static struct shared s;
 
 	(void)state;
 	share_bus(&s, true);
@@ -620,8 +617,7 @@ int main(void)
 	    cmocka_unit_test(a_host_that_refuses_costs_the_loop_nothing),
 	    cmocka_unit_test(a_line_in_use_is_left_alone),
 	    cmocka_unit_test(a_resolver_that_hangs_costs_one_thread),
-	    cmocka_unit_test(a_late_answer_on_a_line_is_never_taken_for_the_next_one),
-	    cmocka_unit_test(a_late_answer_over_tcp_ends_the_connection),
+	    cmocka_unit_test(a_late_answer_is_never_taken_for_the_next_one),
 	    cmocka_unit_test(two_devices_share_a_bus_and_are_polled_alike),
 	    cmocka_unit_test(an_absent_device_costs_the_other_a_tenth_of_a_second_each_second),
 	    cmocka_unit_test(closing_one_device_leaves_the_other),

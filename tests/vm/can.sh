@@ -155,12 +155,14 @@ can_interface_down() {
 # simulated_robot ARGUMENTS...: its servo a CANopen drive at can1, the daemon's configuration at can0.
 simulated_robot() {
     controllers_up
-    "$FACET" simulate hall --servo canopen --endless --can can1:can0 --truth $scratch/truth --dir $scratch/robot "$@" \
+    # A drive has a processor of its own: on this one it comes first.
+    /usr/bin/chrt -f 10 "$FACET" simulate hall --servo canopen --endless --can can1:can0 --truth $scratch/truth --dir $scratch/robot "$@" \
         >$scratch/said 2>&1 &
     robot=$!
     trap 'stop_daemon; stop_robot; cat $scratch/said; judge' EXIT
     until_true 60 grep -q 'faults are ordered' $scratch/said || fail "the robot does not start"
-    sed 's/speed: 30deg/speed: 37.5deg/; s|variant: 180/0.5|variant: 180/1|; s|unix:[^"]*facetd.sock|unix:/run/facetd.sock|' $scratch/robot/facetd.yaml >$scratch/facetd.yaml
+    # This machine is slow: a slow line, a scanner that looks at few places, SYNCs at half the pace, coarse cells.
+    sed 's/speed: 30deg/speed: 37.5deg/; s|baud: 500000, variant: 180/0.5|baud: 38400, variant: 100/1|; s/sync: 10ms/sync: 20ms/; s|unix:[^"]*facetd.sock|unix:/run/facetd.sock|' $scratch/robot/facetd.yaml >$scratch/facetd.yaml
     echo 'map: {cell: 0.2}' >>$scratch/facetd.yaml
 }
 stop_robot() {
@@ -250,37 +252,47 @@ can_by_hand() {
 
 # ---- a wire that goes away, and heartbeats that stay away ----
 
-sweeps_so_far() {
-    grep -o '"sweeps":[0-9]*' $STATUS | tail -n 1 | cut -d: -f2
-}
-more_sweeps() {
-    [ "$(sweeps_so_far)" -ge $((${1:-0} + 2)) ]
+# moves: in the last half second that the simulator wrote.
+moves() {
+    tail -n 500 $scratch/truth | /usr/bin/awk '{ if (NR > 1 && $2 != last) n++; last = $2 } END { exit !(n > 100) }'
 }
 # stands MS: how many ms the axis stood still at the end of what the simulator wrote so far.
 stood_ms() {
     tail -n 6000 $scratch/truth | /usr/bin/awk '{ if ($2 != last) { last = $2; n = 0 } else n++; if (n > most) most = n } END { print most + 0 }'
 }
 
+# Without the scanner, whose rays are too much for this machine beside.
 can_heartbeats() {
     simulated_robot
+    sed -i '/name: laser/,/tilt: servo/d' $scratch/facetd.yaml
     start_daemon
     trap 'stop_daemon; stop_robot; cat $scratch/said; judge' EXIT
     until_true 90 is servo state streaming || fail "the servo does not stream: $(status_of servo error)"
-    until_true 90 more_sweeps 0 || fail "it does not sweep"
+    until_true 30 moves || fail "it does not sweep"
     kill -STOP $daemon
     sleep 4
     kill -CONT $daemon
-    sleep 1
+    began=$(uptime_ms)
     stood=$(stood_ms)
     [ "$stood" -ge 1500 ] || fail "the drive stood for $stood ms only while facetd was stopped for 4 s"
-    before=$(sweeps_so_far)
-    until_true 90 more_sweeps "$before" || fail "it does not sweep again"
+    until_true 60 moves || fail "it does not sweep again"
+    again=$(($(uptime_ms) - began))
     $ip link set can0 down
-    until_true 20 says 'servo: lost: can0 was set down' || fail "the end of the interface is not said"
+    until_true 20 says 'servo: .*can0 was set down' || fail "the end of the interface is not said"
     sleep 3
+    moves && fail "it moves without a master"
     $ip link set can0 up
     began=$(uptime_ms)
-    before=$(sweeps_so_far)
-    until_true 90 more_sweeps "$before" || fail "it does not sweep after the interface is back"
-    echo "note: stood for $stood of 4000 ms; $(($(uptime_ms) - began)) ms after up two more sweeps had ended"
+    until_true 60 moves || fail "it does not sweep after the interface is back"
+    echo "note: stood for $stood of 4000 ms, sweeps $again ms later; $(($(uptime_ms) - began)) ms after the interface is up"
+    # Pulled out, and plugged in.
+    device=$(/usr/bin/readlink -f /sys/class/net/can0/device)
+    echo 1 >"$device/remove"
+    until_true 20 says 'there is no interface can0\|the interface can0 has gone' || fail "that it was pulled out is not said"
+    echo 1 >/sys/bus/pci/rescan
+    until_true 20 test -e /sys/class/net/can0 || fail "the kernel does not find it again"
+    controller_up can0 || fail "it cannot be set up again"
+    began=$(uptime_ms)
+    until_true 60 moves || fail "it does not sweep after it was plugged in again"
+    echo "note: $(($(uptime_ms) - began)) ms after it was plugged in again"
 }

@@ -3,12 +3,18 @@
  * A polled angle was true somewhere between request and answer, so it is stamped at their midpoint; its uncertainty is
  * half the round trip. An answer that took more than three times the median of the last ones waited somewhere nobody
  * knows: it is refused and counted. Round trips of up to a millisecond are never refused: half of that is 0.015 degree
- * at 30 degrees a second, and on a fast network three times the median is within the jitter of any scheduler. */
+ * at 30 degrees a second, and on a fast network three times the median is within the jitter of any scheduler.
+ *
+ * Both registers of a position are read by one request, and yet there are devices that fill them one after the other: an
+ * angle torn at a carry leaps by 65,536 counts. Whatever leaps further than any servo turns is refused and counted, unless
+ * the next one says the same: then the device counts anew. */
 #include "drivers/modbus_parts.h"
 
+#include <math.h>
 #include <stdlib.h>
 #include <string.h>
 
+#include "core/trig.h"
 #include "drivers/jitter.h"
 
 #define RTT_KEPT    31 /* odd: the median is one of them */
@@ -16,11 +22,19 @@
 #define RTT_GOOD_NS 1000000
 #define RTT_LIMIT   3
 #define RTT_MAX_NS  INT64_C(60000000000)
+#define LEAP_RAD    (2 * TRIG_DEG)
+#define LEAP_RAD_S  (1000 * TRIG_DEG)
 #define TIME_MAX_NS (INT64_MAX / 4)
 
-enum { ANGLES, READS, WRITES, REFUSED, NO_ANSWER, SLOW, FOREIGN, MALFORMED, COUNTERS };
-static const char *const counter_name[COUNTERS] = {"angles",    "reads", "writes",  "refused",
-                                                   "no answer", "slow",  "foreign", "malformed"};
+enum { ANGLES, READS, WRITES, REFUSED, NO_ANSWER, SLOW, TORN, FOREIGN, MALFORMED, COUNTERS };
+static const char *const counter_name[COUNTERS] = {"angles", "reads", "writes",  "refused",  "no answer",
+                                                   "slow",   "torn",  "foreign", "malformed"};
+
+struct sample {
+	bool known;
+	double rad;
+	int64_t t_ns;
+};
 
 struct decoder {
 	struct config_device device;
@@ -29,6 +43,7 @@ struct decoder {
 	int rtt_n, rtt_next;
 	double last_rad; /* of the answer before, a refused one too */
 	bool answered;
+	struct sample used, doubted; /* the newest angles that were, and were not */
 	uint64_t count[COUNTERS];
 	struct jitter jitter; /* round trips: for the status, not in the snapshot */
 };
@@ -114,6 +129,26 @@ static bool is_asked(const struct decoder *d, const struct modbus_transaction *t
 	       is_awaited(d, &c->write, t) || is_awaited(d, &c->reset, t) || is_awaited(d, &c->stop, t);
 }
 
+static bool leads_to(const struct sample *s, const struct tilt *tilt)
+{
+	return s->known &&
+	       fabs(tilt->angle_rad - s->rad) <= LEAP_RAD + LEAP_RAD_S * 1e-9 * fabs((double)(tilt->t_ns - s->t_ns));
+}
+
+static bool is_torn(struct decoder *d, const struct tilt *tilt)
+{
+	struct sample now = {true, tilt->angle_rad, tilt->t_ns};
+	bool torn = d->used.known && !leads_to(&d->used, tilt) && !leads_to(&d->doubted, tilt);
+
+	if (torn) {
+		d->doubted = now;
+	} else {
+		d->used = now;
+		d->doubted.known = false;
+	}
+	return torn;
+}
+
 static void decode_angle(struct decoder *d, const struct modbus_transaction *t, const struct record_sink *sink)
 {
 	const struct config_register *position = &d->device.position;
@@ -132,6 +167,10 @@ static void decode_angle(struct decoder *d, const struct modbus_transaction *t, 
 	/* When a servo that stands was read does not matter: such an answer is good however long it took. */
 	if (rtt_is_slow(d, rtt_ns) && !stands) {
 		d->count[SLOW]++;
+		return;
+	}
+	if (is_torn(d, &tilt)) {
+		d->count[TORN]++;
 		return;
 	}
 	d->count[ANGLES]++;
@@ -227,12 +266,20 @@ static void timing(const struct decoder *d, struct decoder_timing *ret)
 	jitter_percentiles(&d->jitter, &ret->jitter_p50_ns, &ret->jitter_p99_ns);
 }
 
+static void sample_state(struct state *s, struct sample *sample)
+{
+	state_bool(s, &sample->known);
+	state_double(s, &sample->rad);
+	state_i64(s, &sample->t_ns);
+	s->failed |= s->loading && llabs(sample->t_ns / 2) >= TIME_MAX_NS;
+}
+
 /* Round trips are kept oldest first: where they lie in their ring matters to nobody. */
 static void fields_state(struct decoder *d, struct state *s)
 {
 	const int oldest = d->rtt_n < RTT_KEPT ? 0 : d->rtt_next;
 
-	state_tag(s, "modbus2");
+	state_tag(s, "modbus3");
 	state_int(s, &d->rtt_n, 0, RTT_KEPT);
 	for (int i = 0; i < d->rtt_n && !s->failed; i++) {
 		state_time(s, &d->rtt_ns[(oldest + i) % RTT_KEPT]);
@@ -241,6 +288,8 @@ static void fields_state(struct decoder *d, struct state *s)
 	d->rtt_next = s->loading ? d->rtt_n % RTT_KEPT : d->rtt_next;
 	state_double(s, &d->last_rad);
 	state_bool(s, &d->answered);
+	sample_state(s, &d->used);
+	sample_state(s, &d->doubted);
 	for (int i = 0; i < COUNTERS; i++)
 		state_u64(s, &d->count[i]);
 }

@@ -31,6 +31,7 @@
 #include <unistd.h>
 
 #include "drivers/modbus_parts.h"
+#include "drivers/modbus_words.h"
 
 #define RESPONSE_US  500000 /* busy machines were seen to sleep for 0.4 s */
 #define SHARED_US    200000 /* of a device that is not alone: shorter than others' watchdogs */
@@ -506,57 +507,9 @@ ssize_t modbus_bus_write(struct link *link, const uint8_t *bytes, size_t len)
 	return n;
 }
 
-static void tell_serial(const struct link *link, int error, char ret[160])
-{
-	const char *line = link->connect;
-
-	if (error == ETIMEDOUT)
-		snprintf(ret, 160, "%.50s: unit %d does not answer: check power, cable, `baud`, `parity` and `unit`",
-		         line, link->unit);
-	else if (error == EPROTO)
-		snprintf(ret, 160, "%.50s: what comes is no answer of unit %d: check `baud`, `parity` and the cable",
-		         line, link->unit);
-	else if (error == EBUSY)
-		snprintf(ret, 160, "%.50s: another program uses this line; end that one, or correct `connect`", line);
-	else if (error == EIO || error == ECONNRESET)
-		snprintf(ret, 160, "%.50s: the line hung up: is the adapter plugged in?", line);
-	else if (error == ENOTTY)
-		snprintf(ret, 160, "%.50s: this is no serial line; correct `connect`", line);
-	else
-		snprintf(ret, 160, "%.50s: the line failed (%s)", line, strerror(error));
-}
-
-/* libmodbus says of a name that nobody knows that it refused. */
-static void tell_tcp(const struct link *link, int error, char ret[160])
-{
-	const char *peer = link->connect;
-
-	if (error == ECONNREFUSED)
-		snprintf(ret, 160,
-		         "%.60s refuses the connection, or nobody knows the name: check address and port in `connect`",
-		         peer);
-	else if (error == EHOSTUNREACH || error == ENETUNREACH)
-		snprintf(ret, 160,
-		         "%.60s cannot be reached: check cable and power, and that this host is in its network", peer);
-	else if (error == ETIMEDOUT)
-		snprintf(ret, 160, "%.60s: unit %d does not answer: check cable, power, address and `unit`", peer,
-		         link->unit);
-	else if (error == ECONNRESET || error == EPIPE)
-		snprintf(ret, 160, "%.60s broke the connection off: it was restarted, or serves too many clients",
-		         peer);
-	else if (error == EPROTO)
-		snprintf(ret, 160, "%.60s: what comes is no answer of unit %d: is this the servo's address?", peer,
-		         link->unit);
-	else
-		snprintf(ret, 160, "the connection to %.60s failed (%s)", peer, strerror(error));
-}
-
 void modbus_bus_error(const struct link *link, int error, char ret[160])
 {
-	if (modbus_line_is_serial(link->connect))
-		tell_serial(link, error, ret);
-	else
-		tell_tcp(link, error, ret);
+	modbus_words_end(link->connect, link->unit, error, ret);
 }
 
 void modbus_bus_close(struct link *link)

@@ -365,9 +365,10 @@ static void next_target(struct sweeper *s, int64_t t_ns)
 		go(s, step_after(s, s->target_rad));
 }
 
+/* It was seen to stand: what was not looked at for a second may have moved. */
 static void nudge(struct sweeper *s, int64_t t_ns)
 {
-	if (t_ns - s->still_ns < STUCK_NS || t_ns - s->taken_ns < STUCK_NS || s->angle_ns < s->taken_ns)
+	if (s->angle_ns - s->still_ns < STUCK_NS || t_ns - s->taken_ns < STUCK_NS || s->angle_ns < s->taken_ns)
 		return;
 	if (s->following_rad > 0.0 && ++s->nudges > NUDGES_MAX) {
 		halt_here(s, "stands still and does not go where it is told; is it enabled, and free to move?");

@@ -354,6 +354,9 @@ static void print_drive(const struct play *p, char text[TEXT_MAX])
 		snprintf(text, TEXT_MAX, "goes on | ");
 	else if (p->still_ns >= 0)
 		snprintf(text, TEXT_MAX, "stands after %lld | ", (long long)((p->stood_ns - p->begin_ns) / RIG_MS));
+	else if (p->moved_ns < p->end_ns)
+		snprintf(text, TEXT_MAX, "stands after %lld, sweeps again meanwhile | ",
+		         (long long)((p->stood_ns - p->begin_ns) / RIG_MS));
 	else
 		snprintf(text, TEXT_MAX, "stands after %lld, sweeps again after %lld | ",
 		         (long long)((p->stood_ns - p->begin_ns) / RIG_MS),

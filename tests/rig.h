@@ -40,6 +40,7 @@ enum rig_transport { RIG_SERIAL, RIG_TCP, RIG_USB, RIG_CAN, RIG_MODBUS };
  *   "no baud"      SERIAL: the line refuses this rate (value)
  *
  * of a CAN bus: those of tools/sim_can_bus.h, and
+ *   "bus late"     there called "late"
  *   "overrun"      so large a share of the frames finds no room in the driver's socket, which is told
  *   "as fd"        frames of the device come as FD frames of 64 bytes
  *   "flood"        somebody fills the bus with frames of the lowest priority

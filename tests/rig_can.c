@@ -41,9 +41,9 @@ enum fault {
 	DELETED,
 	FAULTS
 };
-static const char *const fault_names[] = {"bus-off", "warning", "passive", "errors",   "no ack", "drop",
-                                          "overrun", "late",    "rtr",     "extended", "fd",     "as fd",
-                                          "flood",   "full",    "down",    "deleted",  NULL};
+static const char *const fault_names[] = {"bus-off", "warning",  "passive", "errors",   "no ack", "drop",
+                                          "overrun", "bus late", "rtr",     "extended", "fd",     "as fd",
+                                          "flood",   "full",     "down",    "deleted",  NULL};
 
 struct waiting { /* a frame on its way to the bus */
 	struct can_frame_at frame;

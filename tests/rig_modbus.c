@@ -12,6 +12,7 @@
 #include <string.h>
 
 #include "drivers/modbus_parts.h"
+#include "drivers/modbus_words.h"
 #include "tests/rig_parts.h"
 
 #define RESPONSE_NS    (500 * RIG_MS)
@@ -37,8 +38,9 @@ struct line { /* a device on a bus */
 	int64_t until_ns; /* of CONNECTING, ASKING, LISTENING */
 	int end;          /* of ENDED: errno, told behind the records */
 	struct modbus_transaction asked;
-	int verdict; /* of it: 0 or an errno; EPROTO: no valid answer */
-	bool right;  /* an angle that its drive sent and that can be read */
+	int verdict;     /* of it: 0 or an errno; EPROTO: no valid answer */
+	bool right;      /* an angle that its drive sent and that can be read */
+	int64_t late_ns; /* an answer that nobody waits for any more comes then */
 	struct modbus_transaction wish[WISHES];
 	unsigned first_wish, wishes;
 	int64_t poll_ns, free_ns;
@@ -125,7 +127,8 @@ static void ask(struct line *m, const struct modbus_transaction *request)
 	m->asked.t_request_ns = now_ns;
 	m->state = ASKING;
 	m->right = false;
-	rig_note_request(m->link, bytes, modbus_wire_put(&m->asked, bytes));
+	if (!m->on[UNPLUG])
+		rig_note_request(m->link, bytes, modbus_wire_put(&m->asked, bytes));
 	if (!m->on[UNPLUG])
 		sim_drive_transact(m->drive, &m->asked, heard_ns, &a);
 	m->polls += asks_position(m, request);
@@ -141,6 +144,7 @@ static void ask(struct line *m, const struct modbus_transaction *request)
 		m->verdict = ETIMEDOUT;
 	else if (a.verdict != SIM_DRIVE_ANSWERED)
 		m->verdict = EPROTO;
+	m->late_ns = a.verdict == SIM_DRIVE_SILENT ? 0 : m->until_ns;
 	if (m->verdict == ETIMEDOUT)
 		m->until_ns = now_ns + RESPONSE_NS;
 	if (m->verdict) {
@@ -181,6 +185,7 @@ static void finish(struct line *m)
 	m->free_ns = m->link->rig->now_ns + silence_ns(m);
 	m->state = IDLE;
 	hand_over(m);
+	m->right = false;
 	if (!m->verdict) {
 		m->failures = 0;
 		return;
@@ -191,6 +196,8 @@ static void finish(struct line *m)
 	}
 	m->state = LISTENING;
 	m->until_ns = m->link->rig->now_ns + RESPONSE_NS;
+	if (m->late_ns > m->link->rig->now_ns && m->late_ns < m->until_ns)
+		m->until_ns = m->late_ns + RESPONSE_NS;
 }
 
 /* The machine */
@@ -340,7 +347,7 @@ void modbus_bus_error(const struct link *l, int error, char ret[160])
 {
 	const struct line *m = l->own;
 
-	snprintf(ret, 160, "%.60s: %s", m->device->connect, strerror(error));
+	modbus_words_end(m->device->connect, m->device->slave, error, ret);
 }
 
 void modbus_bus_close(struct link *l)

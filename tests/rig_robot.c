@@ -53,9 +53,11 @@ const char *robot_servo_name(enum robot_servo servo)
 	return name[servo];
 }
 
-static bool is_swung(enum robot_servo servo)
+static bool is_swung(const struct robot_params *p)
 {
-	return servo == ROBOT_CAN || servo == ROBOT_ENCODER || servo == ROBOT_INCLINOMETER;
+	const enum robot_servo servo = p->servo;
+
+	return p->swung || servo == ROBOT_CAN || servo == ROBOT_ENCODER || servo == ROBOT_INCLINOMETER;
 }
 
 static double axis_angle(void *ctx, int64_t t_ns)
@@ -87,6 +89,24 @@ static void add(const char *format, ...)
 	va_end(args);
 }
 
+static void add_modbus(const struct robot_params *p, const char *keys)
+{
+	static const char *const order[] = {"ABCD", "CDAB", "BADC", "DCBA"};
+	const char *of = order[p->order & 3];
+
+	add("  - {name: servo, driver: modbus, connect: %s, parity: none, unit: 3,\n",
+	    p->servo == ROBOT_RTU ? "/dev/servo" : "\"10.0.0.7:502\"");
+	if (p->floats)
+		add("     position: {address: 8, type: f32, order: %s, scale: 1deg, sign: -1},\n"
+		    "     target: {address: 14, type: f32, order: %s, scale: 1deg, sign: -1},\n",
+		    of, of);
+	else
+		add("     position: {address: 0, type: i32, order: %s, scale: 0.001deg, sign: -1},\n"
+		    "     target: {address: 2, type: i32, order: %s, scale: 0.001deg, sign: -1},\n",
+		    of, of);
+	add("     speed: {address: 4, type: u32, order: %s, scale: 0.001deg}%s}\n", of, keys);
+}
+
 static void add_servo(const struct robot_params *p)
 {
 	static const char *const mode[] = {
@@ -116,11 +136,7 @@ static void add_servo(const struct robot_params *p)
 		add("  - {name: servo, driver: canopen, connect: can0, node: %d, sign: -1%s}\n", NODE, keys);
 		break;
 	default:
-		add("  - {name: servo, driver: modbus, connect: %s, parity: none, unit: 3,\n"
-		    "     position: {address: 0, type: i32, scale: 0.001deg, sign: -1},\n"
-		    "     target: {address: 2, type: i32, scale: 0.001deg, sign: -1},\n"
-		    "     speed: {address: 4, type: u32, scale: 0.001deg}%s}\n",
-		    p->servo == ROBOT_RTU ? "/dev/servo" : "\"10.0.0.7:502\"", keys);
+		add_modbus(p, keys);
 	}
 }
 
@@ -139,7 +155,7 @@ static void write_yaml(const struct robot_params *p)
 		    "     left: {id: 0x201, start: 0, length: 32, scale: 0.0001},\n"
 		    "     right: {id: 0x201, start: 32, length: 32, scale: 0.0001}}\n");
 	add("%s", p->devices ? p->devices : "");
-	if (!is_swung(p->servo))
+	if (!is_swung(p))
 		add("sweep: {device: servo, from: -65deg, to: 45deg, speed: %gdeg%s}\n",
 		    p->speed_deg > 0 ? p->speed_deg : 30, p->sweep ? p->sweep : "");
 }
@@ -191,8 +207,12 @@ static void attach_can(struct rig *rig, const struct robot_params *p)
 
 static void attach_modbus(struct rig *rig, const struct robot_params *p)
 {
-	struct sim_drive_params params = {
-	    .unit = 3, .strict = p->strict, .axis = &axis, .acceleration = ACCELERATION, .seed = p->rig.seed};
+	struct sim_drive_params params = {.unit = 3,
+	                                  .strict = p->strict,
+	                                  .order = p->order,
+	                                  .axis = &axis,
+	                                  .acceleration = ACCELERATION,
+	                                  .seed = p->rig.seed};
 	struct sim_drive *drive = sim_drive_create(&params, rig_epoch_ns(rig));
 
 	if (!drive)
@@ -224,7 +244,7 @@ struct rig *robot_create(const struct robot_params *p)
 	params.yaml = yaml;
 	rig = rig_create(&params);
 	sim_axis_init(&axis, -p->angle_deg * TRIG_DEG, rig_epoch_ns(rig));
-	if (is_swung(p->servo))
+	if (is_swung(p))
 		sim_axis_triangle(&axis, 65 * TRIG_DEG, -45 * TRIG_DEG,
 		                  (p->speed_deg > 0 ? p->speed_deg : 30) * TRIG_DEG, ACCELERATION, rig_epoch_ns(rig));
 	rig_follow(rig, tilt_of_axis, NULL);

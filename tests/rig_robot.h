@@ -26,7 +26,10 @@ struct robot_params {
 	bool odometry;         /* wheels at 100 Hz on the bus `can1` */
 	double speed_deg;      /* of the sweep; 0: 30 */
 	double angle_deg;      /* tilt at first */
+	bool swung;            /* somebody else moves it, and it is only read, whatever it could do */
 	bool strict;           /* Modbus: it wants to be enabled, and started for each target */
+	int order;             /* Modbus: of the bytes of 32 bits, as sim_drive_params' */
+	bool floats;           /* Modbus: its numbers are read and written as floats */
 	bool no_pose;          /* nobody but the wheels says where it is */
 	struct rig_params rig; /* without yaml */
 };

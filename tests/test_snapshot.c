@@ -10,8 +10,9 @@
 #include "drivers/clock_filter.h"
 #include "drivers/device_clock.h"
 #include "tests/fuzz_state.h"
+#include "tests/rig_robot.h"
 
-enum { SNAPSHOT_MAX = 4 << 20, ROWS_MAX = 1 << 16, EVERY = 3 };
+enum { SNAPSHOT_MAX = 4 << 20, ROWS_MAX = 1 << 16, EVERY = 3, SELDOM = 11 };
 
 /* What came out of a pipeline: a hash for each row, and for what else happened between them. */
 struct seen {
@@ -97,15 +98,15 @@ static void load(struct pipeline *pipeline, const uint8_t *bytes, size_t len)
 
 /* Each stretch between two cuts is fed twice: to a pipeline that saw all before it, and to one that saw its snapshot only. Rows
  * and the snapshots at the end of the stretch have to agree; so, by induction, every later one does. */
-static void goes_on_from_every_cut(const struct session *s, const char *name)
+static void goes_on_from_every_cut(const struct session *s, const char *name, size_t every)
 {
 	static uint8_t before[SNAPSHOT_MAX], after[SNAPSHOT_MAX], again[SNAPSHOT_MAX];
 	static struct seen whole, part;
 	struct pipeline *pipeline = open_pipeline(s, &whole);
 	size_t len = save(pipeline, before), most = 0, cuts = 0, rows = 0;
 
-	for (size_t from = 0; from < s->entries; from += EVERY, cuts++) {
-		const size_t to = from + EVERY < s->entries ? from + EVERY : s->entries;
+	for (size_t from = 0; from < s->entries; from += every, cuts++) {
+		const size_t to = from + every < s->entries ? from + every : s->entries;
 		struct pipeline *fresh = open_pipeline(s, &part);
 
 		load(fresh, before, len);
@@ -159,7 +160,7 @@ static void goes_on_to_the_end(const struct session *s)
 
 static void check(struct session *s, const char *name)
 {
-	goes_on_from_every_cut(s, name);
+	goes_on_from_every_cut(s, name, EVERY);
 	goes_on_to_the_end(s);
 	session_finish(s);
 }
@@ -231,6 +232,95 @@ static void a_cola_session_goes_on_from_any_snapshot(void **state)
 	cola_session("driver: tim, connect: 192.168.0.1, tilt: servo", SIM_TIM571);
 	cola_session("driver: lms1xx, connect: 192.168.0.1, tilt: servo", SIM_LMS111);
 	cola_session("driver: lms5xx, connect: 192.168.0.1, tilt: laser, encoder: {scale: 0.0001}", SIM_LMS511);
+}
+
+/* Robots: the list is kept in the rig, where drivers command servos and read wheels themselves. */
+
+static void append(struct session *s, struct session_entry entry)
+{
+	if (s->entries == s->cap) {
+		s->cap = s->cap ? 2 * s->cap : 1024;
+		s->entry = realloc(s->entry, s->cap * sizeof *s->entry);
+		assert_non_null(s->entry);
+	}
+	s->entry[s->entries++] = entry;
+}
+
+static void ignore_begin(void *ctx, const void *snapshot, size_t len)
+{
+	(void)ctx;
+	(void)snapshot;
+	(void)len;
+}
+
+static void keep_record(void *ctx, const struct record *record)
+{
+	struct session_entry entry = {.kind = ENTRY_RECORD, .record = *record};
+	uint8_t *own = malloc(record->len ? record->len : 1);
+
+	assert_non_null(own);
+	if (record->len > 0)
+		memcpy(own, record->bytes, record->len);
+	entry.record.bytes = own;
+	append(ctx, entry);
+}
+
+static void keep_tick(void *ctx, int64_t log_ns)
+{
+	append(ctx, (struct session_entry){.kind = ENTRY_TICK, .ns = log_ns});
+}
+
+static void keep_clock(void *ctx, int64_t ahead_ns)
+{
+	append(ctx, (struct session_entry){.kind = ENTRY_CLOCK, .ns = ahead_ns});
+}
+
+static void trouble(struct rig *rig, const char *device, const char *kind, double value)
+{
+	if (!rig_fault(rig, device, kind, value, true))
+		fail_msg("nobody knows the fault \"%s\"", kind);
+	rig_run(rig, 400 * RIG_MS);
+	rig_fault(rig, device, kind, value, false);
+	rig_run(rig, 1100 * RIG_MS);
+}
+
+/* Set up, swept, in trouble, the wall clock set, and back. */
+static void keep_robot(struct session *s, const struct robot_params *params)
+{
+	struct rig *rig = robot_create(params);
+	struct config_error error;
+	const bool modbus = params->servo == ROBOT_RTU || params->servo == ROBOT_TCP;
+	const struct rig_keeper keeper = {
+	    .journal = {
+	        .ctx = s, .begin = ignore_begin, .record = keep_record, .tick = keep_tick, .clock = keep_clock}};
+
+	*s = (struct session){0};
+	assert_int_equal(config_read(robot_yaml(), strlen(robot_yaml()), "robot", &s->config, &error), 0);
+	rig_keep(rig, &keeper);
+	rig_start(rig);
+	rig_run(rig, 2500 * RIG_MS);
+	trouble(rig, "servo", modbus ? params->servo == ROBOT_RTU ? "crc" : "refuse" : "bus-off", 0);
+	trouble(rig, "servo", modbus ? "jitter" : "overrun", modbus ? 20 : 0.2);
+	trouble(rig, "wheels", "short", 0);
+	trouble(rig, "wheels", "no poses", 0);
+	trouble(rig, "servo", "wall clock", 3600);
+	rig_destroy(rig);
+}
+
+static void a_robot_s_session_goes_on_from_any_snapshot(void **state)
+{
+	static const enum robot_servo servos[] = {ROBOT_CAN, ROBOT_CYCLIC, ROBOT_INCLINOMETER, ROBOT_RTU};
+
+	(void)state;
+	for (size_t i = 0; i < sizeof(servos) / sizeof(servos[0]); i++) {
+		struct session s;
+
+		keep_robot(
+		    &s, &(struct robot_params){.servo = servos[i], .odometry = true, .rig = {.seed = 3, .thin = 40}});
+		goes_on_from_every_cut(&s, robot_servo_name(servos[i]), SELDOM);
+		goes_on_to_the_end(&s);
+		session_finish(&s);
+	}
 }
 
 /* Seeds for fuzz_state: small snapshots, and what comes after them. */
@@ -394,6 +484,7 @@ int main(int argc, char **argv)
 	const struct CMUnitTest tests[] = {
 	    cmocka_unit_test(an_lms2xx_session_goes_on_from_any_snapshot),
 	    cmocka_unit_test(a_cola_session_goes_on_from_any_snapshot),
+	    cmocka_unit_test(a_robot_s_session_goes_on_from_any_snapshot),
 	};
 
 	if (argc == 3 && strcmp(argv[1], "seeds") == 0)

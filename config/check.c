@@ -366,6 +366,12 @@ static int check_sweep(struct reader *r, const struct config *config)
 		                   "sweep.device: '%s' %s, so it cannot be commanded", config->sweep.device,
 		                   keys_driver(servo->driver) == KEY_MODBUS ? "has no `target` register"
 		                                                            : "only tells its angle");
+	/* Its angle is known but for whole turns, its target is not: it would turn as far as it is off. */
+	if (keys_driver(servo->driver) == KEY_CANOPEN && servo->count.wrap > 0)
+		return reader_fail(r, reader_line(r, node, "device"),
+		                   "sweep.device: '%s' has a `wrap`, so its targets could be whole turns away; take "
+		                   "`wrap` out and give `zero`",
+		                   config->sweep.device);
 	if (config->sweep.from_rad >= config->sweep.to_rad)
 		return reader_fail(r, reader_line(r, node, "from"), "sweep.from: must be smaller than sweep.to");
 	return check_limits(r, config, servo, node);

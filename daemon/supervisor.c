@@ -538,7 +538,11 @@ void supervisor_start(struct supervisor *s, int64_t t_ns)
 
 int64_t supervisor_stop_ns(const struct config *config)
 {
-	return config->sweep.set && config->sweep.has_rest ? SUPERVISOR_REST_NS : SUPERVISOR_STOP_NS;
+	bool takes_long = config->sweep.set && config->sweep.has_rest;
+
+	for (int i = 0; i < config->devices; i++)
+		takes_long |= config->device[i].stop.n > 0; /* steps may wait for the drive */
+	return takes_long ? SUPERVISOR_REST_NS : SUPERVISOR_STOP_NS;
 }
 
 void supervisor_stop(struct supervisor *s, int64_t t_ns)

@@ -689,6 +689,8 @@ static void servos_and_wheels_that_make_no_sense_are_refused(void **state)
 	assert_refused(text, "f.yaml:2: sweep.rest", "outside the limits of 'd'");
 	snprintf(text, sizeof(text), drive, ", kind: encoder", "-45deg", "");
 	assert_refused(text, "f.yaml:2: sweep.device", "only tells its angle");
+	snprintf(text, sizeof(text), drive, ", wrap: 360", "-45deg", "");
+	assert_refused(text, "f.yaml:2: sweep.device", "whole turns away");
 	snprintf(text, sizeof(text), drive, ", master: 5", "-45deg", "");
 	assert_refused(text, "f.yaml:1: devices[0].node", "our own id");
 	assert_refused("devices: [{name: a, driver: canopen, connect: can0, node: 5, kind: drive}]",

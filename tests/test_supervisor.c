@@ -530,6 +530,22 @@ static void a_servo_has_the_time_to_go_to_its_rest_angle(void **state)
 	end();
 }
 
+/* Cut off in the middle of its `stop`, a drive would be left enabled. */
+static void a_drive_has_the_time_to_be_switched_off(void **state)
+{
+	(void)state;
+	begin(&fake, NULL, NULL);
+	config.device[0].stop.n = 2;
+	world[0].never_ends = true;
+	say(0, "h", 1);
+	supervisor_stop(supervisor, 5 * MS);
+	supervisor_timer(supervisor, 5 * MS + SUPERVISOR_REST_NS - 1);
+	assert_false(supervisor_stopped(supervisor));
+	supervisor_timer(supervisor, supervisor_deadline(supervisor));
+	assert_true(supervisor_stopped(supervisor));
+	end();
+}
+
 static void a_device_that_backs_off_ends_at_once(void **state)
 {
 	(void)state;
@@ -791,6 +807,7 @@ int main(void)
 	    cmocka_unit_test(a_device_without_a_link_just_streams),
 	    cmocka_unit_test(an_orderly_end_asks_every_device_and_waits_at_most_a_second),
 	    cmocka_unit_test(a_servo_has_the_time_to_go_to_its_rest_angle),
+	    cmocka_unit_test(a_drive_has_the_time_to_be_switched_off),
 	    cmocka_unit_test(a_device_that_backs_off_ends_at_once),
 	    cmocka_unit_test(every_opening_is_recorded_before_the_first_write),
 	    cmocka_unit_test(a_device_that_is_back_is_opened_within_a_second),

@@ -116,7 +116,7 @@ static struct link *open_interface(const char *name, const struct can_link_filte
 	int r;
 
 	if (fd < 0) {
-		snprintf(error, 160, "%.15s: this kernel has no CAN sockets (%s): `modprobe can_raw`", name,
+		snprintf(error, 160, "%.15s: no CAN sockets (%s): `modprobe can_raw`; a service: AF_CAN", name,
 		         strerror(errno));
 		return NULL;
 	}

@@ -58,7 +58,7 @@ systemd-analyze security --offline=true --threshold=20 --no-pager "$scratch/open
     fail "a unit without a sandbox passes the threshold"
 
 for word in Type=notify WatchdogSec= SupplementaryGroups=dialout 'DeviceAllow=char-188 rw' 'DeviceAllow=char-166 rw' \
-    'DeviceAllow=char-189 rw' 'DeviceAllow=char-ttyS ' RuntimeDirectory=facetd User=facetd 'RestrictAddressFamilies=.* AF_NETLINK'; do
+    'DeviceAllow=char-189 rw' 'DeviceAllow=char-ttyS ' RuntimeDirectory=facetd User=facetd 'RestrictAddressFamilies=.* AF_NETLINK' 'RestrictAddressFamilies=.* AF_CAN'; do
     grep -q "^$word" "$unit" || fail "the unit lacks $word"
 done
 

@@ -6,6 +6,9 @@
 #include "config/address.h"
 #include "config/reader.h"
 
+#define SET_POINTS_NS_MAX \
+	50000000 /* between two; a longer pause is taken for a program that slept (drivers/sweeper.c) */
+
 static int device_line(const struct reader *r, int device, const char *key)
 {
 	return reader_line(r, r->device_node[device], key);
@@ -371,6 +374,12 @@ static int check_sweep(struct reader *r, const struct config *config)
 		return reader_fail(r, reader_line(r, node, "device"),
 		                   "sweep.device: '%s' has a `wrap`, so its targets could be whole turns away; take "
 		                   "`wrap` out and give `zero`",
+		                   config->sweep.device);
+	if (keys_driver(servo->driver) == KEY_CANOPEN && servo->drive_mode != CANOPEN_POSITION &&
+	    servo->sync_ns > SET_POINTS_NS_MAX)
+		return reader_fail(r, reader_line(r, node, "device"),
+		                   "sweep.device: '%s' is led from SYNC to SYNC, so `sync` may be 50ms at most; or use "
+		                   "`mode: position`",
 		                   config->sweep.device);
 	if (config->sweep.from_rad >= config->sweep.to_rad)
 		return reader_fail(r, reader_line(r, node, "from"), "sweep.from: must be smaller than sweep.to");

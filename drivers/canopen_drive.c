@@ -256,7 +256,9 @@ static void calm(struct canopen_drive *d, int64_t t_ns)
 		                                                      : CONTROL_VOLTAGE;
 		enter(d, CANOPEN_DRIVE_PREPARING, t_ns);
 	} else if (t_ns - d->begun_ns >= 2 * CANOPEN_DRIVE_STEP_NS) {
-		stand(d, t_ns, STANDS_BY_STATE, "does not leave the state %s", canopen_wire_drive_text(d->state));
+		/* Being enabled is what is wrong with it, and nothing to go on by. */
+		stand(d, t_ns, d->state == CANOPEN_ENABLED ? STANDS_BY_ITSELF : STANDS_BY_STATE,
+		      "does not leave the state %s", canopen_wire_drive_text(d->state));
 	} else {
 		/* One that does not care for the gentle way loses its power. */
 		const bool gentle = d->state == CANOPEN_ENABLED && t_ns - d->begun_ns < CANOPEN_DRIVE_STEP_NS;

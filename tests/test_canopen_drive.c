@@ -343,6 +343,25 @@ static void a_step_that_is_not_taken_has_its_sentence(void **state)
 	}
 }
 
+/* Whoever holds it enabled: it is said, and not tried for ever. */
+static void a_drive_that_stays_enabled_is_named_and_left(void **state)
+{
+	(void)state;
+	for (int mode = 0; mode < 3; mode++) {
+		struct plant p = plant(CANOPEN_ENABLED);
+		struct canopen_drive d = drive(modes[mode]);
+		int64_t t_ns = 0;
+
+		p.stays = CANOPEN_ENABLED;
+		canopen_drive_begin(&d, t_ns);
+		run(&d, &p, &t_ns, 2500);
+		assert_int_equal(d.phase, CANOPEN_DRIVE_STANDING);
+		assert_non_null(strstr(d.why, "does not leave the state operation enabled"));
+		run(&d, &p, &t_ns, 60000);
+		assert_int_equal(d.phase, CANOPEN_DRIVE_STANDING);
+	}
+}
+
 static void a_drive_without_a_statusword_is_named(void **state)
 {
 	struct canopen_drive d = drive(CANOPEN_POSITION);
@@ -842,6 +861,7 @@ int main(void)
 	    cmocka_unit_test(who_is_listened_to_is_told_nothing),
 	    cmocka_unit_test(frames_that_get_lost_are_said_again),
 	    cmocka_unit_test(a_step_that_is_not_taken_has_its_sentence),
+	    cmocka_unit_test(a_drive_that_stays_enabled_is_named_and_left),
 	    cmocka_unit_test(a_drive_without_a_statusword_is_named),
 	    cmocka_unit_test(a_fault_is_reset_by_one_edge_and_then_reported),
 	    cmocka_unit_test(bit_7_is_low_before_it_rises),

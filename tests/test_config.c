@@ -691,6 +691,12 @@ static void servos_and_wheels_that_make_no_sense_are_refused(void **state)
 	assert_refused(text, "f.yaml:2: sweep.device", "only tells its angle");
 	snprintf(text, sizeof(text), drive, ", wrap: 360", "-45deg", "");
 	assert_refused(text, "f.yaml:2: sweep.device", "whole turns away");
+	snprintf(text, sizeof(text), drive, ", sync: 51ms, mode: velocity", "-45deg", "");
+	assert_refused(text, "f.yaml:2: sweep.device", "50ms at most");
+	snprintf(text, sizeof(text), drive, ", sync: 50ms, mode: cyclic", "-45deg", "");
+	assert_int_equal(read_text(text, &c, &error), 0);
+	snprintf(text, sizeof(text), drive, ", sync: 51ms", "-45deg", "");
+	assert_int_equal(read_text(text, &c, &error), 0);
 	snprintf(text, sizeof(text), drive, ", master: 5", "-45deg", "");
 	assert_refused(text, "f.yaml:1: devices[0].node", "our own id");
 	assert_refused("devices: [{name: a, driver: canopen, connect: can0, node: 5, kind: drive}]",

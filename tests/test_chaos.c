@@ -210,7 +210,7 @@ static void judge(struct rig *rig, const struct victim *v)
 	const bool scans = strcmp(v->name, "servo") != 0 && strcmp(v->name, "wheels") != 0;
 	struct rig_points points;
 	struct rig_view view;
-	int64_t out = 0;
+	int64_t out = 0, missing;
 
 	rig_view(rig, v->name, &view);
 	memset(&points, 0, sizeof(points));
@@ -240,7 +240,11 @@ static void judge(struct rig *rig, const struct victim *v)
 		view.profiles = (uint64_t)(rig_count(rig, "wheels", "values") + rig_count(rig, "wheels", "short")) / 2;
 		out = 0;
 	}
-	assert_int_equal(view.sent.sent, view.profiles + view.lost_profiles + (uint64_t)out);
+	/* What a node sends before its mapping was read again is counted as not mapped, among PDOs that hold no angle: at most
+	 * one for each time that it was lost. */
+	missing = (int64_t)view.sent.sent - (int64_t)(view.profiles + view.lost_profiles) - out;
+	assert_true(missing >= 0 &&
+	            missing <= (rig_count(rig, v->name, "statuswords") < 0 ? 0 : (int64_t)view.line.losses));
 	assert_true(view.profiles > 0);
 }
 

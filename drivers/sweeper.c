@@ -95,10 +95,18 @@ static double clamp(double v, double a, double b)
 	return v < low ? low : v > high ? high : v;
 }
 
-/* The nearest angle to which a servo may be sent in its sweep. */
-static double within(const struct sweeper *s, double angle_rad)
+/* Seen to move since it took its target. */
+static bool has_set_out(const struct sweeper *s)
 {
-	double angle = clamp(angle_rad, s->from_rad, s->to_rad);
+	return fabs(s->angle_rad - s->start_rad) > NEAR_RAD;
+}
+
+/* Where a servo is told to stay: where it is. An angle may be nonsense, so outside of the sweep it is believed only of a
+ * servo that was seen to set out, and to be between where it stood and its target: on its way in, or to rest. */
+static double stay(const struct sweeper *s)
+{
+	bool way = s->told && has_set_out(s) && (s->angle_rad - s->start_rad) * (s->target_rad - s->angle_rad) >= 0.0;
+	double angle = way ? s->angle_rad : clamp(s->angle_rad, s->from_rad, s->to_rad);
 
 	return s->limited ? clamp(angle, s->limit_rad[0], s->limit_rad[1]) : angle;
 }
@@ -140,10 +148,12 @@ void sweeper_halt(struct sweeper *s, const char *why)
 /* The servo itself is well and would go on to its target: it is told to stay. */
 static void halt_here(struct sweeper *s, const char *why)
 {
+	double angle = stay(s);
+
 	sweeper_halt(s, why);
 	if (s->cyclic)
 		return;
-	s->target_rad = within(s, s->angle_rad);
+	s->target_rad = angle;
 	s->target_due = true;
 }
 
@@ -233,18 +243,13 @@ static void advance_models(struct sweeper *s, int64_t t_ns)
 	s->slow_rad = s->start_rad + sign * (slow < whole ? slow : whole);
 }
 
-/* Never set out: nudges are for that. */
-static bool has_set_out(const struct sweeper *s)
-{
-	return fabs(s->angle_rad - s->start_rad) > NEAR_RAD;
-}
-
 static void judge_target(struct sweeper *s)
 {
 	double sign = s->target_rad < s->start_rad ? -1.0 : 1.0, way = sign * (s->angle_rad - s->start_rad);
 	double ahead = sign * (s->angle_rad - s->fast_rad), behind = sign * (s->slow_rad - s->angle_rad);
 	double beyond = sign * (s->angle_rad - s->target_rad);
 
+	/* One that never set out is nudged. */
 	bool lags = s->model_rad_s > 0.0 && behind > s->following_rad && has_set_out(s);
 
 	if (-way > s->following_rad || (lags && way < 0.0))
@@ -533,5 +538,5 @@ void sweeper_stop(struct sweeper *s, int64_t t_ns)
 	}
 	s->speed_due = s->has_speed && s->speed_rad_s != s->peak_rad_s;
 	s->speed_rad_s = s->peak_rad_s;
-	go(s, s->has_rest ? s->rest_rad : within(s, s->angle_rad));
+	go(s, s->has_rest ? s->rest_rad : stay(s));
 }

@@ -9,7 +9,8 @@
  * wishes for nothing but says how it stands. A drive that is told speeds only adds a part of what it is behind to the
  * set-point's speed.
  *
- * No target and no set-point ever lies outside from..to (but for the rest angle) or the limits. A sweep that is halted
+ * No target and no set-point ever lies outside the limits, nor outside from..to but for the rest angle and for a servo that
+ * is to stay where it is on its way from or to there. A sweep that is halted
  * stays so until sweeper_begin: angles go on being read, nothing more is wished for. */
 #ifndef FACET_DRIVERS_SWEEPER_H
 #define FACET_DRIVERS_SWEEPER_H

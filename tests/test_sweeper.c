@@ -306,6 +306,49 @@ static void a_servo_that_runs_against_a_wall_is_halted_within_a_second(void **st
 	assert_non_null(strstr(wish.why, "behind where"));
 }
 
+/* It is not pressed against what blocks it; but an angle that never moved is believed nowhere outside of the sweep. */
+static void a_servo_that_is_blocked_on_its_way_in_or_out_is_told_to_stay_there(void **state)
+{
+	struct config config = sweep_config();
+	struct sweeper sweeper;
+	struct sweeper_wish wish;
+	int64_t t_ns = 0;
+
+	(void)state;
+	for (int limited = 0; limited < 2; limited++) {
+		struct servo servo = good_servo(80.0 * DEG);
+
+		config.device[0].has_limits = limited;
+		config.device[0].limits_rad[0] = -60.0 * DEG;
+		config.device[0].limits_rad[1] = 50.0 * DEG;
+		sweeper_init(&sweeper, &config, 0, false, true);
+		sweeper_begin(&sweeper, t_ns);
+		while (servo.angle > 70.0 * DEG)
+			assert_int_equal(run(&sweeper, &servo, &t_ns, 0.01, &wish), SWEEPER_RUNS);
+		servo.share = 0.0;
+		assert_int_equal(run(&sweeper, &servo, &t_ns, 10.0, &wish), SWEEPER_HALTED);
+		assert_true(fabs(servo.target - (limited ? 50.0 * DEG : servo.angle)) < 0.01 * DEG);
+	}
+	config.device[0].has_limits = false;
+	config.sweep.has_rest = true;
+	config.sweep.rest_rad = 90.0 * DEG;
+	struct servo servo = good_servo(0.0);
+
+	sweeper_init(&sweeper, &config, 0, false, true);
+	sweeper_begin(&sweeper, t_ns);
+	run(&sweeper, &servo, &t_ns, 3.0, &wish);
+	sweeper_stop(&sweeper, t_ns);
+	servo.wall = 60.0 * DEG;
+	assert_int_equal(run(&sweeper, &servo, &t_ns, 10.0, &wish), SWEEPER_HALTED);
+	assert_true(fabs(servo.target - 60.0 * DEG) < 0.01 * DEG);
+
+	servo = good_servo(80.0 * DEG);
+	servo.share = 0.0;
+	sweeper_begin(&sweeper, t_ns);
+	assert_int_equal(run(&sweeper, &servo, &t_ns, 10.0, &wish), SWEEPER_HALTED);
+	assert_true(servo.target == 30.0 * DEG);
+}
+
 static void a_servo_that_never_moves_is_told_three_times_then_halted(void **state)
 {
 	struct config config = sweep_config();
@@ -627,6 +670,7 @@ int main(void)
 	    cmocka_unit_test(a_servo_of_half_the_speed_is_halted_with_a_sentence_and_told_to_stay),
 	    cmocka_unit_test(a_servo_that_is_too_fast_goes_too_far_or_the_wrong_way_is_halted),
 	    cmocka_unit_test(a_servo_that_runs_against_a_wall_is_halted_within_a_second),
+	    cmocka_unit_test(a_servo_that_is_blocked_on_its_way_in_or_out_is_told_to_stay_there),
 	    cmocka_unit_test(a_servo_that_never_moves_is_told_three_times_then_halted),
 	    cmocka_unit_test(a_servo_that_missed_a_target_is_told_again),
 	    cmocka_unit_test(a_target_beyond_a_limit_is_never_sent),

@@ -161,8 +161,9 @@ simulated_robot() {
     robot=$!
     trap 'stop_daemon; stop_robot; cat $scratch/said; judge' EXIT
     until_true 60 grep -q 'faults are ordered' $scratch/said || fail "the robot does not start"
-    # This machine is slow: a slow line, a scanner that looks at few places, SYNCs at half the pace, coarse cells.
-    sed 's/speed: 30deg/speed: 37.5deg/; s|baud: 500000, variant: 180/0.5|baud: 38400, variant: 100/1|; s/sync: 10ms/sync: 20ms/; s|unix:[^"]*facetd.sock|unix:/run/facetd.sock|' $scratch/robot/facetd.yaml >$scratch/facetd.yaml
+    # This machine is slow: a slow line, a scanner that looks at few places, SYNCs at half the pace, and turns so gentle that a
+    # SYNC without an answer, as there are some where both ends have one processor, still bends no angle; coarse cells.
+    sed 's/speed: 30deg/speed: 37.5deg/; s|baud: 500000, variant: 180/0.5|baud: 38400, variant: 100/1|; s/sync: 10ms/sync: 20ms/; s/acceleration: 300deg/acceleration: 150deg/; s|unix:[^"]*facetd.sock|unix:/run/facetd.sock|' $scratch/robot/facetd.yaml >$scratch/facetd.yaml
     echo 'map: {cell: 0.2}' >>$scratch/facetd.yaml
 }
 stop_robot() {
@@ -188,6 +189,9 @@ can_swept() {
     cat $scratch/figures
     echo "note: beams: $(figure $scratch/figures beam_errors), angle error p50 $(figure $scratch/figures beam_error_p50_deg), p99 $(figure $scratch/figures beam_error_p99_deg), max $(figure $scratch/figures beam_error_max_deg) degree"
     echo "note: angles: $(figure $scratch/figures angles) at $(figure $scratch/figures rate_hz) Hz, p99 $(figure $scratch/figures error_p99_deg), max $(figure $scratch/figures error_max_deg) degree; $rows rows, $sweeps sweeps, $faces faces"
+    # What is judged is where an angle is said to be, not how many this processor can carry: of 50 a second.
+    below 48 "$(figure $scratch/figures rate_hz)" ||
+        { echo "this machine is too busy: $(figure $scratch/figures rate_hz) of 50 angles a second"; exit 77; }
     [ "${faces:-0}" -ge 500 ] || fail "the mesh has only $faces faces"
     [ "${sweeps:-0}" -ge $((seconds_swept / 5)) ] || fail "only $sweeps sweeps in $seconds_swept s"
     [ "$(figure $scratch/figures beam_errors)" -ge $((seconds_swept * 500)) ] || fail "too few beams"

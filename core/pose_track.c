@@ -69,9 +69,9 @@ struct pose_track {
 	int64_t moved_ns;        /* the end of the last motion */
 	double speed_m_s, rad_s; /* in it */
 	double z_m;
-	struct quat level; /* roll and pitch of the last absolute pose */
-	bool absolute_seen;
-	int64_t absolute_ns; /* the newest one taken */
+	struct quat level;             /* roll and pitch of the last absolute pose */
+	bool absolute_seen, corrected; /* `corrected`: by one before that which is being taken */
+	int64_t absolute_ns;           /* the newest one taken */
 
 	uint64_t seen_begin, seen_end;
 	struct seen seen[SEEN]; /* ring, in the frame that is handed out */
@@ -593,17 +593,23 @@ static void go_ahead(struct pose_track *k, int64_t t_ns)
 }
 
 /* The jump of a pose that the wheels, or the poses before it, do not explain. False: it is none, or was ignored; then the
- * track is right as it is. */
+ * track is right as it is. The first absolute pose of all is never ignored: before it there is no correction to be held,
+ * only the origin where a track begins that had waited for it in vain. */
 static bool jump(struct pose_track *k, const struct judgement *j, const struct pose *pose, const struct place *place,
                  struct pose_track_out *ret)
 {
 	const struct place own = place_of(pose);
 
-	if (k->params.on_jump == POSE_TRACK_IGNORE) {
+	if (k->params.on_jump == POSE_TRACK_IGNORE && k->corrected) {
 		hold_frame(k, j, &own, pose->t_ns, ret);
 		return false;
 	}
 	move_frame(k, j, place, pose->t_ns, ret);
+	if (k->params.on_jump == POSE_TRACK_IGNORE) {
+		ret->jump.done = POSE_TRACK_KEEP;
+		k->jumped = false; /* there is no way back */
+		k->before = (struct place){.q = NO_TURN};
+	}
 	return true;
 }
 
@@ -674,6 +680,7 @@ void pose_track_absolute(struct pose_track *k, const struct pose *pose, struct p
 		k->count.late++;
 		return;
 	}
+	k->corrected = k->absolute_seen;
 	k->absolute_seen = true;
 	k->absolute_ns = pose->t_ns;
 	if (!k->begun) {

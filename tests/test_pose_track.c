@@ -563,6 +563,33 @@ static void an_ordinary_drive_has_no_jumps(void **state)
 	}
 }
 
+/* A localisation that comes up after the wheels: what was held until then was the origin, and no correction. */
+static void the_first_absolute_pose_is_never_ignored(void **state)
+{
+	struct pose_track_params params = both;
+	struct pose_track *track;
+	struct pose_track_out out;
+
+	(void)state;
+	params.on_jump = POSE_TRACK_IGNORE;
+	track = open_track(params);
+	straight(track, 0, 300);
+	out = take(track, pose_at(T0 + 2995 * MS, 7, 8, 0));
+	assert_true(out.has_jump && out.jump.done == POSE_TRACK_KEEP && out.pose.jumped);
+	out = straight(track, 300, 301);
+	assert_place(&out.pose, 7.015, 8, 0, 1e-6);
+	/* From then on jumps are. */
+	out = take(track, pose_at(T0 + 3005 * MS, 20, 8, 0));
+	assert_true(out.has_jump && out.jump.done == POSE_TRACK_IGNORE && !out.jump.back);
+	out = straight(track, 301, 302);
+	assert_place(&out.pose, 7.025, 8, 0, 1e-6);
+	out = take(track, pose_at(T0 + 3015 * MS, 7.02, 8, 0));
+	assert_true(out.has_jump && out.jump.back);
+	out = straight(track, 302, 303);
+	assert_place(&out.pose, 7.035, 8, 0, 1e-6);
+	pose_track_destroy(track);
+}
+
 static void a_jump_under_odometry_is_done_as_ordered(void **state)
 {
 	static const enum pose_track_on_jump modes[] = {POSE_TRACK_KEEP, POSE_TRACK_IGNORE, POSE_TRACK_NEW_MAP};
@@ -752,6 +779,7 @@ int main(void)
 	    cmocka_unit_test(a_jump_ignored_leaves_no_trace),
 	    cmocka_unit_test(an_outlier_is_one_jump_and_one_back),
 	    cmocka_unit_test(an_ordinary_drive_has_no_jumps),
+	    cmocka_unit_test(the_first_absolute_pose_is_never_ignored),
 	    cmocka_unit_test(a_jump_under_odometry_is_done_as_ordered),
 	    cmocka_unit_test(corrections_below_the_threshold_are_no_jumps),
 	    cmocka_unit_test(a_snapshot_goes_on_from_anywhere),

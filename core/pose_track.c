@@ -36,6 +36,7 @@
 #define PIECE_M_MAX   100.0       /* of one motion */
 #define PIECE_RAD_MAX 100.0
 #define FAR_M         1e7  /* the track is held within: a square of it loses no metre */
+#define UNKNOWN_M2    1e6  /* of a place that nobody knows */
 #define VARIANCE_MAX  1e12 /* likewise */
 #define SIGMA_MIN_M   1e-4 /* an absolute pose is not better than this where it says how good it is */
 #define SIGMA_MIN_RAD 1e-5
@@ -697,10 +698,11 @@ void pose_track_absolute(struct pose_track *k, const struct pose *pose, struct p
 	}
 }
 
-/* The first motion begins the track, at the map's origin, unless an absolute pose is about to come. */
+/* The first motion begins the track, at the map's origin, unless an absolute pose is about to come. Where one should have
+ * come and did not, nobody knows where that origin is: `trust` then holds the rows back until one does. */
 static bool begin_with(struct pose_track *k, const struct motion *m)
 {
-	const struct mark origin = {.t_ns = m->from_ns};
+	struct mark origin = {.t_ns = m->from_ns};
 
 	if (k->params.absolute && (!k->waiting || m->from_ns < k->waited_ns)) {
 		k->waiting = true;
@@ -708,6 +710,8 @@ static bool begin_with(struct pose_track *k, const struct motion *m)
 	}
 	if (k->params.absolute && m->t_ns - k->waited_ns < WAIT_NS)
 		return false;
+	if (k->params.absolute)
+		origin.p[0] = origin.p[3] = UNKNOWN_M2;
 	begin_at(k, &origin);
 	return true;
 }

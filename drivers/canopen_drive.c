@@ -530,14 +530,30 @@ static void put_set_point(struct canopen_drive *d, int64_t t_ns, struct canopen_
 	d->due_ns = t_ns + CANOPEN_DRIVE_REPEAT_NS;
 }
 
+static void shake(struct canopen_drive *d, int64_t t_ns, int hand)
+{
+	d->handshake = hand;
+	d->step_ns = d->looked_ns = t_ns;
+	d->waited_ns = 0;
+}
+
+/* A program that stood still itself has not listened meanwhile, and says again what it wants before it judges. */
+static bool is_unanswered(struct canopen_drive *d, int64_t t_ns)
+{
+	const int64_t gap_ns = t_ns - d->looked_ns;
+
+	d->waited_ns += gap_ns < CANOPEN_DRIVE_REPEAT_NS ? gap_ns : CANOPEN_DRIVE_REPEAT_NS;
+	d->looked_ns = t_ns;
+	return d->waited_ns >= CANOPEN_DRIVE_STEP_NS;
+}
+
 static void raise_set_point(struct canopen_drive *d, int64_t t_ns, struct canopen_drive_wish *ret)
 {
 	d->raised = d->demand = d->target;
 	d->goes = false;
 	d->moves = true;
 	d->control = CONTROL_ENABLE | CONTROL_BEGIN | (d->status & STATUS_REACHED ? 0 : CONTROL_AT_ONCE);
-	d->handshake = SET_POINT_RAISED;
-	d->step_ns = t_ns;
+	shake(d, t_ns, SET_POINT_RAISED);
 	put_set_point(d, t_ns, ret);
 }
 
@@ -550,8 +566,7 @@ static void shake_hands(struct canopen_drive *d, int64_t t_ns, struct canopen_dr
 		if (!d->goes || d->speed_due)
 			break;
 		if (ack) { /* nobody's, or what homing made of this bit: it has to go first */
-			d->handshake = SET_POINT_LOWERED;
-			d->step_ns = t_ns;
+			shake(d, t_ns, SET_POINT_LOWERED);
 			command(d, CONTROL_ENABLE, t_ns);
 		} else {
 			raise_set_point(d, t_ns, ret);
@@ -561,8 +576,7 @@ static void shake_hands(struct canopen_drive *d, int64_t t_ns, struct canopen_dr
 		if (ack) {
 			d->taken++;
 			d->taken_count = d->raised;
-			d->handshake = SET_POINT_LOWERED;
-			d->step_ns = t_ns;
+			shake(d, t_ns, SET_POINT_LOWERED);
 			command(d, CONTROL_ENABLE, t_ns);
 		} else if (t_ns >= d->due_ns) {
 			put_set_point(d, t_ns, ret); /* both were lost, or the one with the target was */
@@ -575,7 +589,7 @@ static void shake_hands(struct canopen_drive *d, int64_t t_ns, struct canopen_dr
 			command(d, CONTROL_ENABLE, t_ns);
 		break;
 	}
-	if (d->handshake != SET_POINT_NONE && t_ns - d->step_ns >= CANOPEN_DRIVE_STEP_NS)
+	if (d->handshake != SET_POINT_NONE && is_unanswered(d, t_ns))
 		stand(d, t_ns, STANDS_BY_ITSELF, "%s (statusword %04X, bit 12)",
 		      d->handshake == SET_POINT_RAISED ? "does not acknowledge its target"
 		                                       : "does not take its acknowledgement back",

@@ -98,6 +98,7 @@ struct canopen_drive {
 
 	/* Set-points of mode position. */
 	enum { SET_POINT_NONE, SET_POINT_RAISED, SET_POINT_LOWERED } handshake;
+	int64_t waited_ns, looked_ns; /* for its other hand, as far as it was looked at; when that was */
 	bool goes, speed_due, moves;
 	int32_t target, raised;
 	uint32_t speed;

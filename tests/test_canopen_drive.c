@@ -631,6 +631,33 @@ static void an_acknowledgement_of_nothing_has_to_go_first(void **state)
 	}
 }
 
+/* The machine stood still: what the drive answered meanwhile has not been read yet. */
+static void a_stall_in_mid_handshake_halts_nothing(void **state)
+{
+	(void)state;
+	struct plant p = plant(CANOPEN_SWITCH_ON_DISABLED);
+	struct canopen_drive d = drive(CANOPEN_POSITION);
+	struct canopen_drive_wish wish;
+	int64_t t_ns = 0;
+
+	canopen_drive_begin(&d, t_ns);
+	run(&d, &p, &t_ns, 500);
+	p.extra = 0x1000;
+	run(&d, &p, &t_ns, 100);
+	canopen_drive_goto(&d, 5);
+	run(&d, &p, &t_ns, 20);
+	for (int stall = 0; stall < 3; stall++) {
+		t_ns += 3 * CANOPEN_DRIVE_STEP_NS;
+		canopen_drive_step(&d, t_ns, &wish);
+		assert_int_equal(d.phase, CANOPEN_DRIVE_RUNNING);
+		assert_true(wish.frames > 0); /* it is said again */
+	}
+	p.extra = 0;
+	run(&d, &p, &t_ns, 500);
+	assert_int_equal(d.phase, CANOPEN_DRIVE_RUNNING);
+	assert_int_equal(p.set_points, 1);
+}
+
 static void nothing_beyond_its_own_limits_is_sent(void **state)
 {
 	(void)state;
@@ -874,6 +901,7 @@ int main(void)
 	    cmocka_unit_test(a_target_that_changes_at_once_is_taken_at_once),
 	    cmocka_unit_test(a_handshake_that_fails_has_its_sentence),
 	    cmocka_unit_test(an_acknowledgement_of_nothing_has_to_go_first),
+	    cmocka_unit_test(a_stall_in_mid_handshake_halts_nothing),
 	    cmocka_unit_test(nothing_beyond_its_own_limits_is_sent),
 	    cmocka_unit_test(limits_that_are_none_are_none),
 	    cmocka_unit_test(a_following_error_or_a_limit_stops_the_sweep),

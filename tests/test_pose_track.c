@@ -90,6 +90,28 @@ static struct pose_track_status status_of(const struct pose_track *track)
 	return status;
 }
 
+/* A localisation that stays away: nobody knows where the wheels began. */
+static void an_origin_that_nobody_knows_is_not_trusted(void **state)
+{
+	struct pose_track *lost = open_track(both), *alone = open_track(wheels);
+	struct pose_track_out of_lost = {0}, of_alone = {0};
+
+	(void)state;
+	for (int i = 0; i < 300; i++) {
+		of_lost = drive(lost, T0 + i * 10 * MS, T0 + (i + 1) * 10 * MS, 0.005, 0);
+		of_alone = drive(alone, T0 + i * 10 * MS, T0 + (i + 1) * 10 * MS, 0.005, 0);
+	}
+	assert_true(of_lost.has_pose && of_alone.has_pose);
+	assert_true(of_lost.pose.variance_m2 > 1e4);
+	assert_true(of_alone.pose.variance_m2 < 0.1);
+	take(lost, pose_at(T0 + 3000 * MS, 7, 8, 1));
+	of_lost = drive(lost, T0 + 3000 * MS, T0 + 3010 * MS, 0, 0);
+	assert_true(of_lost.pose.variance_m2 < 0.1);
+	assert_place(&of_lost.pose, 7, 8, 1, 1e-6);
+	pose_track_destroy(lost);
+	pose_track_destroy(alone);
+}
+
 static void without_odometry_poses_pass_to_the_bit(void **state)
 {
 	struct pose_track *track = open_track(poses(POSE_TRACK_KEEP));
@@ -760,6 +782,7 @@ static void time_set_back_begins_the_way_anew(void **state)
 int main(void)
 {
 	const struct CMUnitTest tests[] = {
+	    cmocka_unit_test(an_origin_that_nobody_knows_is_not_trusted),
 	    cmocka_unit_test(without_odometry_poses_pass_to_the_bit),
 	    cmocka_unit_test(a_circle_is_driven_in_closed_form),
 	    cmocka_unit_test(a_square_is_driven_backwards_too),

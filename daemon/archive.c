@@ -3,6 +3,7 @@
  * the next map meanwhile. A folder that is missing or a disk that is full costs the file, never more. */
 #include "daemon/archive.h"
 
+#include <dirent.h>
 #include <errno.h>
 #include <fcntl.h>
 #include <limits.h>
@@ -130,12 +131,29 @@ static int save(struct job *job)
 	return r;
 }
 
+/* Files named as this one is: 32 hex digits and .ply. A folder that cannot be read has none, and writing says why. */
+static int maps_in(const char *folder)
+{
+	DIR *dir = opendir(folder);
+	int n = 0;
+
+	for (const struct dirent *entry; dir && (entry = readdir(dir)) != NULL;)
+		n += strspn(entry->d_name, "0123456789abcdef") == 32 && strcmp(entry->d_name + 32, ".ply") == 0;
+	if (dir)
+		closedir(dir);
+	return n;
+}
+
 static void on_work(uv_work_t *work)
 {
 	struct job *job = work->data;
-	const int r = save(job);
+	const bool full = maps_in(job->archive->folder) >= ARCHIVE_FILES_MAX;
+	const int r = full ? 0 : save(job);
 
 	publisher_old_destroy(job->old);
+	if (full)
+		snprintf(job->error, sizeof(job->error), "%s holds %d maps already, and gets no more; move them away",
+		         job->archive->folder, ARCHIVE_FILES_MAX);
 	if (r < 0)
 		snprintf(job->error, sizeof(job->error), "%s cannot be written (%s); see to the folder map.archive",
 		         job->path, strerror(-r));

@@ -16,6 +16,9 @@ struct archive_result {
 	const char *error;
 	uint32_t triangles;
 };
+/* Files of maps in the folder, of whatever run: a localisation that jumps and jumps fills no disk. At the limit nothing more is
+ * saved, and the sentence says so; nothing is ever deleted here. */
+#define ARCHIVE_FILES_MAX 100
 typedef void (*archive_done)(void *ctx, const struct archive_result *); /* on the loop */
 
 struct archive;

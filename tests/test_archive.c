@@ -162,12 +162,47 @@ static void too_many_at_once_are_refused_with_a_sentence(void **state)
 	assert_int_equal(uv_loop_close(&loop), 0);
 }
 
+static void a_folder_full_of_maps_gets_no_more(void **state)
+{
+	char folder[] = "/tmp/test_archive.XXXXXX", path[100], error[200] = "";
+	struct archive *archive;
+	uv_loop_t loop;
+
+	(void)state;
+	memset(&seen, 0, sizeof(seen));
+	assert_non_null(mkdtemp(folder));
+	uv_loop_init(&loop);
+	archive = archive_create(&loop, folder, 0.05, on_done, &seen);
+	for (int i = 0; i < ARCHIVE_FILES_MAX; i++) {
+		snprintf(path, sizeof(path), "%s/%032x.ply", folder, (unsigned)i);
+		fclose(fopen(path, "w"));
+	}
+	for (int room = 0; room < 2; room++) {
+		assert_true(archive_save(archive, ID, make_old(2), error));
+		uv_run(&loop, UV_RUN_DEFAULT);
+		assert_int_equal(seen.saved, room);
+		assert_true(room || strstr(seen.error, "move them away"));
+		unlink(path); /* one was taken away */
+	}
+	assert_int_equal(files_in(folder), ARCHIVE_FILES_MAX);
+	for (int i = 0; i < ARCHIVE_FILES_MAX - 1; i++) {
+		snprintf(path, sizeof(path), "%s/%032x.ply", folder, (unsigned)i);
+		assert_int_equal(unlink(path), 0);
+	}
+	snprintf(path, sizeof(path), "%s/" ID_TEXT ".ply", folder);
+	assert_int_equal(unlink(path), 0);
+	rmdir(folder);
+	archive_destroy(archive);
+	assert_int_equal(uv_loop_close(&loop), 0);
+}
+
 int main(void)
 {
 	const struct CMUnitTest tests[] = {
 	    cmocka_unit_test(a_saved_map_is_a_whole_file_of_its_id),
 	    cmocka_unit_test(what_cannot_be_written_is_said),
 	    cmocka_unit_test(too_many_at_once_are_refused_with_a_sentence),
+	    cmocka_unit_test(a_folder_full_of_maps_gets_no_more),
 	};
 
 	return cmocka_run_group_tests(tests, NULL, NULL);

@@ -249,6 +249,10 @@ static int check_canopen(struct reader *r, const struct config *config, int i)
 	if (device->node == device->master)
 		return reader_fail(r, device_line(r, i, "node"),
 		                   "devices[%d].node: %d is our own id; write another `master`", i, device->node);
+	if ((device->sync_ns > 0 && device->sync_ns < 1000000) ||
+	    (device->heartbeat_ns > 0 && device->heartbeat_ns < 10000000))
+		return reader_fail(r, device->line,
+		                   "devices[%d]: `sync` is 0 or at least 1ms, `heartbeat` 0 or at least 10ms", i);
 	if (device->count.scale == 0 && (device->kind == CANOPEN_DRIVE || device->kind == CANOPEN_ENCODER))
 		return reader_fail(r, device->line, "devices[%d]: `scale` is missing: the angle of one count", i);
 	for (int j = 0; j < i; j++) {

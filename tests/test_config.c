@@ -705,6 +705,10 @@ static void servos_and_wheels_that_make_no_sense_are_refused(void **state)
 	               "f.yaml:1: devices[0].connect", "no CAN interface");
 	assert_refused("devices: [{name: a, driver: canopen, connect: an_interface_that_is_long, node: 5}]",
 	               "f.yaml:1: devices[0].connect", "no CAN interface");
+	assert_refused("devices: [{name: a, driver: canopen, connect: can0, node: 5, sync: 1us}]",
+	               "f.yaml:1: devices[0]", "at least 1ms");
+	assert_refused("devices: [{name: a, driver: canopen, connect: can0, node: 5, heartbeat: 1ms}]",
+	               "f.yaml:1: devices[0]", "at least 10ms");
 	assert_refused("devices: [{name: a, driver: odometry, connect: can0}]", "f.yaml:1: devices[0]",
 	               "either `speed` and `turn`, or");
 	assert_refused(

@@ -11,7 +11,7 @@
 #define SUPERVISOR_STEADY_NS      2000000000ll /* who streamed so long begins with the first back-off again */
 #define SUPERVISOR_STOP_NS        1000000000ll /* an orderly end takes no longer ... */
 #define SUPERVISOR_REST_NS \
-	8000000000ll            /* ... or so long where a servo goes to its rest angle or has a `stop` (systemd kills after 10 s) */
+	8000000000ll /* ... or so long where a servo goes to its rest angle or has a `stop` (systemd kills after 10 s) */
 #define SUPERVISOR_READS_MAX 16 /* of one device in one turn of the loop */
 /* What one device may cost: beyond it reading waits, and the kernel holds the rest. Five echoes of an LMS5xx in CoLa-A,
  * the most that any device has to say, are 1 MB/s. */

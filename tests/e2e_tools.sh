@@ -70,7 +70,9 @@ for ending in ply obj stl glb json; do
 done
 "$facet" save "$address" --ascii -o "$scratch/ascii.ply" >/dev/null && grep -q '^format ascii' "$scratch/ascii.ply" || fail "--ascii"
 [ "$(cat "$scratch/map.json")" = "[]" ] || fail "map.json is not the list of planes"
-"$facet" picture "$scratch/map.ply" -o "$scratch/map.png" --size 160x100 || fail "no picture of the map"
+# The servo looks up first: a map of half a sweep may be all ceiling, and nothing is left below the cut.
+"$facet" save "$address" -o "$scratch/look.ply" --wait-steps 220 --timeout 120 >/dev/null || fail "no snapshot at step 220"
+"$facet" picture "$scratch/look.ply" -o "$scratch/map.png" --size 160x100 || fail "no picture of the map"
 ls "$scratch" | grep -q 'part' && fail "something half written is left"
 refused 1 "no whole map of step 99999999" "$facet" save "$address" -o "$scratch/never.ply" --wait-steps 99999999 --timeout 0.5
 [ -e "$scratch/never.ply" ] && fail "a map was written that never came"

@@ -414,12 +414,13 @@ static int ask(struct watch *watch, char error[CLIENT_ERROR_MAX])
 		watch->client = client_open(watch->address, CONNECT_MS, error);
 	if (!watch->client)
 		return -ENOTCONN;
+	/* Who watches is told every second without asking: asked for as well, answers would gather in the socket. */
 	if (shows_events(watch) && !watch->told && client_say(watch->client, "?WATCH={\"enable\":true}", error))
 		return -ENOTCONN;
-	watch->told = true;
-	const int status = client_say(watch->client, "?STATUS", error);
+	const int status = shows_events(watch) && watch->told ? 0 : client_say(watch->client, "?STATUS", error);
 	if (status)
 		return status;
+	watch->told = true;
 	json_t *json = read_answer(watch, &line, error);
 	if (!json)
 		return -EPROTO;
@@ -440,8 +441,9 @@ static void wait_until(struct timespec *next, const sigset_t *mask)
 		left.tv_sec--;
 		left.tv_nsec += 1000000000;
 	}
-	if (left.tv_sec >= 0)
-		ppoll(NULL, 0, &left, mask);
+	if (left.tv_sec < 0)
+		left = (struct timespec){0};
+	ppoll(NULL, 0, &left, mask);
 }
 
 static int run(struct watch *watch)
@@ -467,7 +469,10 @@ static int run(struct watch *watch)
 			show_loss(watch, error);
 		if (watch->once || ferror(stdout))
 			break;
-		next.tv_sec++;
+		if (shows_events(watch) && !status)
+			clock_gettime(CLOCK_MONOTONIC, &next); /* the daemon has the pace */
+		else
+			next.tv_sec++;
 		wait_until(&next, &before); /* the only place where signals come through */
 	} while (!stopped);
 	terminal_end(watch);

@@ -23,8 +23,7 @@
 
 #define CAN_REFUSED 1 /* kind of a reply: the reason has changed; payload: one byte, enum can_signal_verdict */
 
-#define TIME_MAX_NS (INT64_MAX / 4) /* of what is recorded: differences have room */
-#define RENEW_NS    2000000000ll    /* a link on which nothing good came for so long is opened anew */
+#define RENEW_NS 2000000000ll /* a link on which nothing good came for so long is opened anew */
 
 /* Decoder */
 
@@ -105,7 +104,7 @@ static void take_frame(struct decoder *d, const struct can_frame_at *f, int64_t 
 	d->last = verdict;
 	if (verdict != CAN_SIGNAL_GOOD)
 		return;
-	if (log_ns > -TIME_MAX_NS && log_ns < TIME_MAX_NS)
+	if (log_ns > -CAN_WIRE_TIME_MAX && log_ns < CAN_WIRE_TIME_MAX)
 		jitter_note(&d->jitter, log_ns - f->t_ns);
 	sink->tilt(sink->ctx, d->index, &tilt);
 }
@@ -123,7 +122,7 @@ static void decode(struct decoder *d, const struct record *record, const struct 
 		struct can_frame_at f;
 		const ssize_t n = can_wire_get(record->bytes + at, record->len - at, &f);
 
-		if (n <= 0 || f.t_ns <= -TIME_MAX_NS || f.t_ns >= TIME_MAX_NS) {
+		if (n <= 0) {
 			d->count[MALFORMED]++;
 			return;
 		}

@@ -49,6 +49,8 @@ ssize_t can_wire_get(const uint8_t *bytes, size_t len, struct can_frame_at *ret)
 	ret->flags = bytes[5];
 	memcpy(ret->data, bytes + DATA, ret->len);
 	ret->t_ns = (int64_t)((uint64_t)get32(bytes + at) | (uint64_t)get32(bytes + at + 4) << 32);
+	if (ret->t_ns <= -CAN_WIRE_TIME_MAX || ret->t_ns >= CAN_WIRE_TIME_MAX)
+		return -EINVAL;
 	return (ssize_t)(at + 8);
 }
 

@@ -37,6 +37,7 @@
 
 #define CAN_WIRE_ENTRY    24 /* bytes of an entry */
 #define CAN_WIRE_ENTRY_FD 80
+#define CAN_WIRE_TIME_MAX (INT64_MAX / 4) /* of an entry, either side of 0 */
 
 struct can_frame_at { /* a frame at its time */
 	uint32_t id;  /* with its flags, as above */
@@ -48,7 +49,8 @@ struct can_frame_at { /* a frame at its time */
 /* Length of the entry written to `ret` (at least CAN_WIRE_ENTRY_FD bytes). */
 size_t can_wire_put(const struct can_frame_at *, uint8_t *ret);
 
-/* Length of the entry at the start of `bytes`; 0: cut off; -EINVAL: no such entry (a length that its kind cannot have). */
+/* Length of the entry at the start of `bytes`; 0: cut off; -EINVAL: no such entry (a length that its kind
+ * cannot have, or a time whose differences have no room). */
 ssize_t can_wire_get(const uint8_t *bytes, size_t len, struct can_frame_at *ret);
 
 /* A classic data frame to be sent; `len` at most 8. */

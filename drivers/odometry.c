@@ -30,7 +30,6 @@
 
 #define LANES       2
 #define SAMPLES     64                  /* of a lane, that the other one has not reached */
-#define TIME_MAX_NS (INT64_MAX / 4)     /* of what is recorded: differences have room */
 #define RENEW_NS    INT64_C(2000000000) /* a link on which nothing good came for so long is opened anew */
 #define SILENCE_NS  INT64_C(250000000)  /* a speed is not carried on for longer */
 #define SET_BACK_NS INT64_C(2000000000) /* older by more than this: time was set back */
@@ -270,7 +269,7 @@ static void take_frame(struct decoder *d, const struct can_frame_at *f, int64_t 
 		good |= take_lane(d, i, f, sink);
 	if (!good)
 		return;
-	if (log_ns > -TIME_MAX_NS && log_ns < TIME_MAX_NS)
+	if (log_ns > -CAN_WIRE_TIME_MAX && log_ns < CAN_WIRE_TIME_MAX)
 		jitter_note(&d->jitter, log_ns - f->t_ns);
 	advance(d, sink);
 }
@@ -290,7 +289,7 @@ static void decode(struct decoder *d, const struct record *record, const struct 
 		struct can_frame_at f;
 		const ssize_t n = can_wire_get(record->bytes + at, record->len - at, &f);
 
-		if (n <= 0 || f.t_ns <= -TIME_MAX_NS || f.t_ns >= TIME_MAX_NS) {
+		if (n <= 0) {
 			d->count[MALFORMED]++;
 			return;
 		}

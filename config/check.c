@@ -419,6 +419,38 @@ static int check_listen(struct reader *r, const struct config *config)
 	return 0;
 }
 
+static int check_origins(struct reader *r, const struct config *config, int listen)
+{
+	for (int i = 0; i < config->listen.origins; i++) {
+		const char *text = config->listen.origin[i], *host = strstr(text, "://");
+
+		if (!host || !host[3] || strchr(host + 3, '/') || (strncmp(text, "http", 4) != 0))
+			return reader_fail(
+			    r, reader_line(r, listen, "origins"),
+			    "listen.origins: '%.60s' is no origin; write it like https://app.foxglove.dev", text);
+	}
+	return 0;
+}
+
+/* Nobody gets in by default (decision D11): beyond loopback a token and TLS are needed. */
+static int check_http(struct reader *r, const struct config *config)
+{
+	const int listen = reader_child(r, r->tree->root, "listen"), line = reader_line(r, listen, "http");
+	char text[CONFIG_TEXT_MAX + 4], sentence[ADDRESS_ERROR_MAX];
+	struct address address;
+
+	snprintf(text, sizeof(text), "tcp:%s", config->listen.http);
+	if (config->listen.http[0] && address_parse(text, ADDRESS_TCP, &address, sentence) < 0)
+		return reader_fail(r, line, "listen.http: %s", sentence);
+	if (config->listen.http[0] && address_check_loopback(&address, sentence) < 0 &&
+	    (!config->listen.token_file[0] || !config->listen.has_tls))
+		return reader_fail(r, line,
+		                   "listen.http: '%.60s' is beyond loopback: that needs listen.token_file and "
+		                   "listen.tls; or use ssh -L",
+		                   config->listen.http);
+	return check_origins(r, config, listen);
+}
+
 int config_check(struct reader *r, const struct config *config)
 {
 	int error = 0;
@@ -428,5 +460,7 @@ int config_check(struct reader *r, const struct config *config)
 		error = check_sweep(r, config);
 	if (!error)
 		error = check_box(r, config);
-	return error ? error : check_listen(r, config);
+	if (!error)
+		error = check_listen(r, config);
+	return error ? error : check_http(r, config);
 }

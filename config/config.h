@@ -210,9 +210,24 @@ struct config {
 		char native[CONFIG_LISTEN_MAX][CONFIG_TEXT_MAX]; /* unix:PATH, tcp:HOST:PORT */
 		int natives;
 		char group[CONFIG_NAME_MAX];
-		int send_buffer; /* bytes; 0: the system's */
-		int clients;     /* at the limit: accept, say why, close */
+		int send_buffer;            /* bytes; 0: the system's */
+		int clients;                /* at the limit: accept, say why, close */
+		char http[CONFIG_TEXT_MAX]; /* HOST:PORT; empty: none */
+		bool http_set;              /* written by the user: then it must be possible */
+		char token_file[CONFIG_TEXT_MAX];
+		bool has_tls;
+		char certificate[CONFIG_TEXT_MAX], key[CONFIG_TEXT_MAX];
+		char origin[CONFIG_LISTEN_MAX][CONFIG_TEXT_MAX]; /* of other pages that may open WebSockets */
+		int origins;
 	} listen;
+	struct {
+		char dir[CONFIG_TEXT_MAX]; /* empty: none is begun with the daemon */
+		int64_t chunk_ns;
+		uint64_t max_size;  /* bytes; 0: no limit */
+		int64_t max_age_ns; /* 0: no limit */
+		uint64_t keep;      /* bytes of all files in `dir`; 0: none is deleted */
+		bool messages;
+	} record;
 };
 
 struct config_error {

@@ -33,6 +33,7 @@ enum key_group {
 	GROUP_ENCODER,
 	GROUP_SWEEP,
 	GROUP_LISTEN,
+	GROUP_TLS,
 	GROUP_RECORD,
 	GROUP_STATE,
 	GROUPS
@@ -91,6 +92,7 @@ struct key {
 	int word_value;      /* ... and what it stands for */
 	enum key_group inner;
 	size_t offset, size; /* in the structure of the group; size 0: checked, not stored */
+	size_t count;        /* KEY_TEXTS: offset of the int that says how many there are */
 	size_t flag;         /* offset of a bool there that says the key was written; 0: none */
 	const char *later;   /* only the default works so far; what comes later */
 	const char *help;

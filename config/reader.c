@@ -280,22 +280,23 @@ static int read_word(struct reader *r, const struct key *key, int at, void *to)
 
 /* Values of several parts ---------------------------------------------------------------------------------------- */
 
-static int read_texts(struct reader *r, const struct key *key, int at, struct config *config)
+static int read_texts(struct reader *r, const struct key *key, int at, void *base)
 {
 	const struct yaml_node *node = node_at(r, at);
+	char(*text)[CONFIG_TEXT_MAX] = (void *)((char *)base + key->offset);
 	int n = 0;
 	if (node->kind != YAML_LIST)
-		return reader_fail(r, node->line, "%s: a list is needed here, like [unix:/run/facetd/facetd.sock]",
-		                   r->path);
+		return reader_fail(r, node->line, "%s: a list is needed here, like [%s]", r->path,
+		                   key->example ? key->example : "unix:/run/facetd/facetd.sock");
 	for (int child = node->first; child >= 0; child = node_at(r, child)->next, n++) {
 		if (n == CONFIG_LISTEN_MAX)
 			return reader_fail(r, node_at(r, child)->line, "%s: at most %d are possible", r->path,
 			                   CONFIG_LISTEN_MAX);
-		const int error = read_text(r, key, child, config->listen.native[n], CONFIG_TEXT_MAX);
+		const int error = read_text(r, key, child, text[n], CONFIG_TEXT_MAX);
 		if (error)
 			return error;
 	}
-	config->listen.natives = n;
+	*(int *)((char *)base + key->count) = n;
 	return 0;
 }
 
@@ -589,6 +590,12 @@ static int unknown_key(struct reader *r, enum key_group group, unsigned drivers,
 	                   r->path[0] ? " in " : "", r->path, nearest->name);
 }
 
+/* A limit that is left empty is none, as is 0, its default. */
+static bool may_be_empty(const struct key *key)
+{
+	return (key->type == KEY_INTEGER || key->type == KEY_DURATION) && key->preset && strcmp(key->preset, "0") == 0;
+}
+
 static int read_key(struct reader *r, enum key_group group, unsigned drivers, int at, void *base)
 {
 	const struct yaml_node *node = node_at(r, at);
@@ -601,8 +608,8 @@ static int read_key(struct reader *r, enum key_group group, unsigned drivers, in
 	snprintf(r->path + length, sizeof(r->path) - length, "%s%s", length ? "." : "", key->name);
 	const int value = node->next;
 	int error = 0;
-	if (!key->later || node_at(r, value)->kind != YAML_TEXT || !yaml_is_null(node_at(r, value)) ||
-	    key->type != KEY_TEXT)
+	const bool empty = node_at(r, value)->kind == YAML_TEXT && yaml_is_null(node_at(r, value));
+	if (!(empty && (key->later ? key->type == KEY_TEXT : may_be_empty(key))))
 		error = read_value(r, key, value, base);
 	if (!error && key->later)
 		error = judge_later(r, key, value);
@@ -654,7 +661,7 @@ int reader_group(struct reader *r, enum key_group group, unsigned drivers, int m
 	if (map < 0)
 		return 0;
 	if (yaml_is_null(node_at(r, map))) /* an empty section is none; an empty device or register is a mistake */
-		return group == GROUP_SWEEP || group == GROUP_BOX || group == GROUP_ENCODER
+		return group == GROUP_SWEEP || group == GROUP_BOX || group == GROUP_ENCODER || group == GROUP_TLS
 		           ? 0
 		           : check_required(r, group, drivers, map);
 	if (!r->path[0] && node_at(r, map)->kind == YAML_LIST)

@@ -216,12 +216,50 @@ static void what_comes_later_is_accepted_at_its_default_only(void **state)
 	assert_refused("map: {planes: on}", "f.yaml:1: map.planes", "will come later");
 	assert_refused("map: {field: hoppe}", "f.yaml:1: map.field", "will come later");
 	assert_refused("map: {window: 30m}", "f.yaml:1: map.window", "will come later");
-	assert_refused("listen: {http: 127.0.0.1:7880}", "f.yaml:1: listen.http", "will come later");
-	assert_refused("listen: {tls: {cert: a}}", "f.yaml:1: listen.tls", "one text");
-	assert_refused("record: {dir: /tmp}", "f.yaml:1: record.dir", "will come later; until then leave it empty");
-	assert_refused("record: {messages: on}", "f.yaml:1: record.messages", "later");
 	assert_refused("state: {file: /tmp/m}", "f.yaml:1: state.file", "later");
 	assert_refused("robot: {step: 0.1}", "f.yaml:1: robot.step", "later");
+}
+
+static void a_page_beyond_loopback_needs_a_token_and_tls(void **state)
+{
+	struct config_error error;
+	struct config c;
+	const char *open = "listen: {http: '0.0.0.0:7880', token_file: /etc/t, tls: {certificate: a, key: b}}";
+
+	(void)state;
+	assert_int_equal(read_text("{}", &c, &error), 0);
+	assert_string_equal(c.listen.http, "127.0.0.1:7880");
+	assert_false(c.listen.http_set || c.listen.has_tls);
+	assert_int_equal(read_text("listen: {http: }", &c, &error), 0);
+	assert_string_equal(c.listen.http, "");
+	assert_int_equal(read_text("listen: {http: '[::1]:0'}", &c, &error), 0);
+	assert_true(c.listen.http_set);
+	assert_int_equal(read_text(open, &c, &error), 0);
+	assert_true(c.listen.has_tls);
+	assert_string_equal(c.listen.key, "b");
+	assert_refused("listen: {http: '192.168.0.5:7880'}", "f.yaml:1: listen.http",
+	               "needs listen.token_file and listen.tls");
+	assert_refused("listen: {http: '192.168.0.5:80', token_file: /t}", "f.yaml:1: listen.http", "listen.tls");
+	assert_refused("listen: {http: robot}", "f.yaml:1: listen.http", "");
+	assert_refused("listen: {tls: {certificate: a}}", "f.yaml:1: listen.tls", "key");
+	assert_refused("listen: {origins: [app.foxglove.dev]}", "f.yaml:1: listen.origins", "is no origin");
+	assert_int_equal(read_text("listen: {origins: ['https://a.b', 'http://localhost:8080']}", &c, &error), 0);
+	assert_int_equal(c.listen.origins, 2);
+	assert_string_equal(c.listen.origin[1], "http://localhost:8080");
+}
+
+static void recordings_have_limits_or_none(void **state)
+{
+	struct config_error error;
+	struct config c;
+
+	(void)state;
+	assert_int_equal(
+	    read_text("record: {dir: /tmp/r, max_size: 2G, max_age: 1h, keep: , messages: on}", &c, &error), 0);
+	assert_string_equal(c.record.dir, "/tmp/r");
+	assert_true(c.record.max_size == 2147483648u && c.record.max_age_ns == 3600000000000ll && c.record.keep == 0);
+	assert_true(c.record.messages && c.record.chunk_ns == 1000000000);
+	assert_refused("record: {chunk: 0s}", "f.yaml:1: record.chunk", "");
 }
 
 static void names_must_lead_somewhere(void **state)
@@ -824,6 +862,8 @@ int main(int argc, char **argv)
 	    cmocka_unit_test(a_number_is_a_number_with_a_unit_of_its_kind),
 	    cmocka_unit_test(a_key_written_twice_is_refused_wherever_it_stands),
 	    cmocka_unit_test(what_comes_later_is_accepted_at_its_default_only),
+	    cmocka_unit_test(a_page_beyond_loopback_needs_a_token_and_tls),
+	    cmocka_unit_test(recordings_have_limits_or_none),
 	    cmocka_unit_test(names_must_lead_somewhere),
 	    cmocka_unit_test(every_driver_gets_what_it_needs),
 	    cmocka_unit_test(registers_that_cannot_be_are_refused),

@@ -108,6 +108,15 @@ ifeq ($(call have,umockdev-1.0),yes)
 $(B)/obj/tests/test_cola_usb.o $(B)/obj/tests/usb_bed.o: CFLAGS_ALL += -DHAVE_UMOCKDEV $(shell pkg-config --cflags umockdev-1.0)
 $(B)/tests/test_cola_usb $(B)/tests/usb_bed: LIBS += $(shell pkg-config --libs umockdev-1.0)
 endif
+# The viewer's page, one for all configurations, embedded by daemon/page.c. Without node or its packages it is left out.
+PAGE := build/viewer
+PAGE_SOURCES := $(wildcard viewer/*)
+$(PAGE)/pages.h: $(PAGE_SOURCES) $(if $(wildcard $(PAGE)/left_out),again)
+	@viewer/build $(PAGE)
+	@[ ! -e $(PAGE)/left_out ] || echo "  without the viewer's page: $$(cat $(PAGE)/left_out)"
+.PHONY: again
+$(B)/obj/daemon/page.o: $(PAGE)/pages.h
+$(B)/obj/daemon/page.o: CFLAGS_ALL += -I$(PAGE)
 $(addprefix $(B)/tests/,$(PROGRAMS)): $(B)/tests/%: $(B)/obj/tests/%.o $(LIBRARIES)
 	@mkdir -p $(@D)
 	@echo '  LD   $@'
@@ -120,6 +129,7 @@ $(B)/tests/fuzz_%: $(B)/obj/tests/fuzz_%.o $(LIBRARIES)
 # Purposes are installed first and the build starts in a second make, whose pkg-config then knows them.
 check:
 	@tools/deps build optional check check-$$(uname -m)
+	@tools/deps browser || echo "check: without a browser the viewer's tests are skipped" >&2
 	@$(MAKE) --no-print-directory config=$(config) run-check
 run-check: all tests
 	@tests/run $(B)

@@ -1,0 +1,1 @@
+import { Scene } from "three"; new Scene();

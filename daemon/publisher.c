@@ -24,6 +24,7 @@
 #include <stdlib.h>
 #include <string.h>
 
+#define PUBLISHER_PINS_MAX PUBLISHER_CLIENT_MAX
 #define OUT_BYTES (32u << 10)                               /* gathered for one write */
 #define PINS_MAX  (PUBLISHER_PINS_MAX / sizeof(struct pin)) /* in the list of one batch */
 

@@ -191,7 +191,7 @@ void model_finish(struct model *model)
 	*model = (struct model){0};
 }
 
-static bool buffer_reserve(struct buffer *buffer, size_t more)
+bool buffer_reserve(struct buffer *buffer, size_t more)
 {
 	size_t cap = buffer->cap ? buffer->cap : 256;
 	if (buffer->error)

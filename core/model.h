@@ -28,6 +28,7 @@ struct buffer {
 	size_t len, cap;
 	int error; /* 0, -ENOMEM, or -EFBIG: more than the format can hold (4 GB of .glb) */
 };
+bool buffer_reserve(struct buffer *, size_t more); /* room behind `len`; false: memory is out, and it is remembered */
 void buffer_append(struct buffer *, const void *data, size_t len);
 void buffer_printf(struct buffer *, const char *format, ...) __attribute__((format(printf, 2, 3)));
 void buffer_finish(struct buffer *);

@@ -14,11 +14,15 @@
  * were found true; ABORT forgets the batch. So at no time does the mirror hold parts of two steps. */
 #include "core/native.h"
 
+#include "core/coded.h"
+
 #include <assert.h>
 #include <errno.h>
 #include <stdio.h>
 #include <stdlib.h>
 #include <string.h>
+
+#include <zstd.h>
 
 _Static_assert(__BYTE_ORDER__ == __ORDER_LITTLE_ENDIAN__,
                "the wire is little-endian and so is every machine built for");
@@ -31,6 +35,8 @@ enum {
 	RUN_BYTES = 4 + 1 + 2,
 	KEY_BYTES = 12,
 	STEP_BYTES = 8,
+	PACKED = 1, /* the flag of a frame */
+	PACK_LEVEL = 1,
 	BATCH_MAX = 1 << 20, /* patches or removals of one batch; a BEGIN that announces more is refused */
 };
 
@@ -159,6 +165,12 @@ void native_put_patch(struct buffer *b, const struct patch *patch)
 	put_indices(b, patch);
 }
 
+void native_put_coded(struct buffer *b, const uint8_t *patches, size_t len)
+{
+	put_head(b, NATIVE_CODED, len);
+	buffer_append(b, patches, len);
+}
+
 void native_put_remove(struct buffer *b, struct patch_key key)
 {
 	put_head(b, NATIVE_REMOVE, KEY_BYTES);
@@ -185,6 +197,94 @@ void native_put_json(struct buffer *b, const char *text, size_t len)
 void native_put_ping(struct buffer *b)
 {
 	put_head(b, NATIVE_PING, 0);
+}
+
+/* Compression */
+
+static int refuse(char error[128], const char *text)
+{
+	snprintf(error, 128, "%s", text);
+	return -EPROTO;
+}
+
+struct native_packer {
+	ZSTD_CCtx *zstd;
+	struct buffer room; /* for a frame that turns out no smaller */
+};
+
+struct native_packer *native_packer_create(void)
+{
+	struct native_packer *packer = calloc(1, sizeof(*packer));
+
+	if (!packer)
+		return NULL;
+	packer->zstd = ZSTD_createCCtx();
+	if (!packer->zstd || ZSTD_isError(ZSTD_CCtx_setParameter(packer->zstd, ZSTD_c_compressionLevel, PACK_LEVEL))) {
+		native_packer_destroy(packer);
+		return NULL;
+	}
+	return packer;
+}
+
+void native_packer_destroy(struct native_packer *packer)
+{
+	if (!packer)
+		return;
+	ZSTD_freeCCtx(packer->zstd);
+	buffer_finish(&packer->room);
+	free(packer);
+}
+
+int native_put_packed(struct native_packer *packer, struct buffer *b, const uint8_t *frame, size_t len)
+{
+	const size_t payload = len - NATIVE_HEAD, bound = ZSTD_compressBound(payload);
+	size_t n;
+
+	assert(len >= NATIVE_HEAD);
+	packer->room.len = 0;
+	if (!buffer_reserve(&packer->room, bound)) {
+		b->error = -ENOMEM;
+		return -ENOMEM;
+	}
+	n = ZSTD_compress2(packer->zstd, packer->room.data, bound, frame + NATIVE_HEAD, payload);
+	if (ZSTD_isError(n) || n >= payload) {
+		buffer_append(b, frame, len);
+		return b->error;
+	}
+	put_u32(b, (uint32_t)(NATIVE_HEAD - 4 + n));
+	put_u8(b, frame[4]);
+	put_u8(b, PACKED);
+	put_u16(b, 0);
+	buffer_append(b, packer->room.data, n);
+	return b->error;
+}
+
+/* The size that the bytes declare is judged before memory is asked for it; they may not hold more than it, nor less. */
+int native_unpack(const uint8_t *frame, size_t len, size_t max, struct buffer *ret, char error[128])
+{
+	unsigned long long size;
+	size_t n;
+
+	if (len < NATIVE_HEAD || native_scan(frame, len, SIZE_MAX) != (ssize_t)len || !native_is_packed(frame))
+		return refuse(error, "bytes that are no compressed frame");
+	size = ZSTD_getFrameContentSize(frame + NATIVE_HEAD, len - NATIVE_HEAD);
+	if (size == ZSTD_CONTENTSIZE_ERROR || size == ZSTD_CONTENTSIZE_UNKNOWN || size > max - NATIVE_HEAD)
+		return refuse(error, "a compressed frame of an impossible size");
+	put_u32(ret, (uint32_t)(NATIVE_HEAD - 4 + size));
+	put_u8(ret, frame[4]);
+	put_u8(ret, 0);
+	put_u16(ret, 0);
+	if (!buffer_reserve(ret, size)) {
+		refuse(error, "no memory for a compressed frame");
+		return -ENOMEM;
+	}
+	n = ZSTD_decompress(ret->data + ret->len, size, frame + NATIVE_HEAD, len - NATIVE_HEAD);
+	if (ZSTD_isError(n) || n != size) {
+		ret->len -= NATIVE_HEAD;
+		return refuse(error, "a compressed frame that cannot be decompressed");
+	}
+	ret->len += size;
+	return 0;
 }
 
 /* Decoding */
@@ -230,12 +330,6 @@ ssize_t native_scan(const uint8_t *data, size_t len, size_t max)
 	if ((len > 5 && data[5] > 1) || (len > 6 && data[6] != 0) || (len > 7 && data[7] != 0))
 		return -EPROTO;
 	return len < (size_t)length + 4 ? 0 : (ssize_t)length + 4;
-}
-
-static int refuse(char error[128], const char *text)
-{
-	snprintf(error, 128, "%s", text);
-	return -EPROTO;
 }
 
 static int decode_hello(const uint8_t *p, size_t len, struct native_hello *ret, char error[128])
@@ -373,6 +467,23 @@ static int decode_patch(const uint8_t *p, size_t len, struct patch **ret, char e
 	return 0;
 }
 
+/* Only that whole patches stand in a row; each is judged when it is decoded. */
+static int decode_coded(const uint8_t *p, size_t len, struct native_message *ret, char error[128])
+{
+	if (len == 0)
+		return refuse(error, "a CODED without patches");
+	for (size_t at = 0; at < len;) {
+		const ssize_t n = coded_scan(p + at, len - at);
+
+		if (n < 0)
+			return refuse(error, "a CODED whose patches are not whole");
+		at += (size_t)n;
+	}
+	ret->coded.bytes = p;
+	ret->coded.len = len;
+	return 0;
+}
+
 static int decode_payload(const uint8_t *p, size_t len, struct native_message *ret, char error[128])
 {
 	switch (ret->type) {
@@ -401,6 +512,8 @@ static int decode_payload(const uint8_t *p, size_t len, struct native_message *r
 		return 0;
 	case NATIVE_PING:
 		return len == 0 ? 0 : refuse(error, "a PING of the wrong length");
+	case NATIVE_CODED:
+		return decode_coded(p, len, ret, error);
 	case NATIVE_PLANE:
 	case NATIVE_PLANE_GONE:
 		break;
@@ -416,7 +529,7 @@ int native_decode(const uint8_t *frame, size_t len, struct native_message *ret, 
 
 	if (len < NATIVE_HEAD || native_scan(frame, len, SIZE_MAX) != (ssize_t)len)
 		return refuse(error, "bytes that are no frame");
-	if (frame[5] & 1) {
+	if (native_is_packed(frame)) {
 		refuse(error, "a compressed message, which nobody asked for");
 		return -ENOTSUP;
 	}
@@ -514,19 +627,37 @@ static int apply_begin(struct native_mirror *mirror, const struct native_begin *
 	return 0;
 }
 
-static int apply_patch(struct native_mirror *mirror, struct native_message *message, char error[128])
+/* Takes the reference over, also when it fails. */
+static int apply_patch(struct native_mirror *mirror, struct patch *patch, char error[128])
 {
-	struct patch *patch = message->patch;
-
-	if (!mirror->in_batch)
-		return refuse(error, "a PATCH outside of a batch");
-	if (mirror->pending_patches == mirror->begin.patches)
-		return refuse(error, "more patches than the batch announced");
-	if (patch->version > mirror->begin.step)
-		return refuse(error, "a PATCH that is newer than its batch");
-	message->patch = NULL;
+	const char *fault = !mirror->in_batch                                  ? "a PATCH outside of a batch"
+	                    : mirror->pending_patches == mirror->begin.patches ? "more patches than the batch announced"
+	                    : patch->version > mirror->begin.step              ? "a PATCH that is newer than its batch"
+	                                                                       : NULL;
+	if (fault) {
+		patch_unref(patch);
+		return refuse(error, fault);
+	}
 	mirror->pending_patches++;
 	return pend(mirror, patch, error);
+}
+
+static int apply_coded(struct native_mirror *mirror, const uint8_t *bytes, size_t len, char error[128])
+{
+	int r = 0;
+
+	for (size_t at = 0; at < len && r == 0;) {
+		const ssize_t n = coded_scan(bytes + at, len - at);
+		struct patch *patch;
+
+		if (n < 0)
+			return refuse(error, "a CODED whose patches are not whole");
+		r = coded_get_patch(bytes + at, (size_t)n, &patch, error);
+		if (r == 0)
+			r = apply_patch(mirror, patch, error);
+		at += (size_t)n;
+	}
+	return r;
 }
 
 static int apply_remove(struct native_mirror *mirror, struct patch_key key, char error[128])
@@ -590,7 +721,10 @@ static int apply_message(struct native_mirror *mirror, struct native_message *me
 	case NATIVE_BEGIN:
 		return apply_begin(mirror, &message->begin, error);
 	case NATIVE_PATCH:
-		return apply_patch(mirror, message, error);
+		message->type = NATIVE_PING; /* the mirror has it now */
+		return apply_patch(mirror, message->patch, error);
+	case NATIVE_CODED:
+		return apply_coded(mirror, message->coded.bytes, message->coded.len, error);
 	case NATIVE_REMOVE:
 		return apply_remove(mirror, message->remove, error);
 	case NATIVE_COMMIT:

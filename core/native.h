@@ -9,7 +9,7 @@
 #include "core/patch.h"
 
 #define NATIVE_MAJOR           1
-#define NATIVE_MINOR           0
+#define NATIVE_MINOR           1 /* 1: CODED, and frames compressed with zstd, both on request */
 #define NATIVE_PORT            7878
 #define NATIVE_HEAD            8 /* u32 length of what follows, u8 type, u8 flags, u16 0 */
 #define NATIVE_FROM_CLIENT_MAX (64u << 10)
@@ -26,7 +26,17 @@ enum native_type {
 	NATIVE_COMMIT,
 	NATIVE_ABORT,
 	NATIVE_JSON,
-	NATIVE_PING
+	NATIVE_PING,
+	NATIVE_CODED /* one or several patches in the compact form */
+};
+
+/* Flags of WANT: what a client wishes, and is ready to read. */
+enum {
+	NATIVE_WANT_PLANES = 1,
+	NATIVE_WANT_CODED = 2, /* patches come as CODED */
+	NATIVE_WANT_BOX = 4,
+	NATIVE_WANT_RADIUS = 8,
+	NATIVE_WANT_ZSTD = 16 /* any frame may come compressed */
 };
 
 struct native_hello {
@@ -39,7 +49,7 @@ struct native_hello {
 };
 
 struct native_want {
-	uint8_t flags; /* 1 planes, 2 coded, 4 box, 8 radius */
+	uint8_t flags; /* NATIVE_WANT_... */
 	uint32_t bytes_per_s;
 	float region[6];
 };
@@ -64,6 +74,10 @@ struct native_message {
 			const char *text;
 			size_t len;
 		} json; /* borrowed from the bytes */
+		struct {
+			const uint8_t *bytes;
+			size_t len;
+		} coded; /* patches one after another, whole (core/coded.h), borrowed from the bytes */
 	};
 };
 
@@ -72,6 +86,7 @@ void native_put_hello(struct buffer *, const struct native_hello *);
 void native_put_want(struct buffer *, const struct native_want *); /* pads: no length whose low byte is 0x3F or 0x7B */
 void native_put_begin(struct buffer *, const struct native_begin *);
 void native_put_patch(struct buffer *, const struct patch *);
+void native_put_coded(struct buffer *, const uint8_t *patches, size_t len); /* as coded_put_patch made them, in a row */
 void native_put_remove(struct buffer *, struct patch_key);
 void native_put_step(struct buffer *, enum native_type commit_or_abort, uint64_t step);
 void native_put_json(struct buffer *, const char *text, size_t len);
@@ -80,7 +95,23 @@ void native_put_ping(struct buffer *);
 /* Bytes of the first whole frame, 0: more is needed, -EPROTO: no frame can begin so (length beyond `max`, reserved bytes). */
 ssize_t native_scan(const uint8_t *data, size_t len, size_t max);
 
-/* Decodes one whole frame; -EPROTO with a sentence where it is not valid (every count judged before use); -ENOTSUP for
+/* Appends the frame compressed, or as it is where that is not smaller. Level 1 of zstd: the bytes are a function of the
+ * frame and of the library's version. 0 or -ENOMEM (also in the buffer). */
+struct native_packer;
+struct native_packer *native_packer_create(void); /* NULL: memory is out. About 300 KB that every frame uses again */
+void native_packer_destroy(struct native_packer *);
+int native_put_packed(struct native_packer *, struct buffer *, const uint8_t *frame, size_t len);
+
+static inline bool native_is_packed(const uint8_t *frame)
+{
+	return frame[5] & 1;
+}
+
+/* Appends the plain frame of a compressed one. -EPROTO with a sentence where it is not valid, or would be longer than `max`
+ * (judged before anything is decompressed); -ENOMEM. Only for those who asked for compressed frames. */
+int native_unpack(const uint8_t *frame, size_t len, size_t max, struct buffer *ret, char error[128]);
+
+/* Decodes one whole plain frame; -EPROTO with a sentence where it is not valid (every count judged before use); -ENOTSUP for
  * a type this version does not know (skip it). */
 int native_decode(const uint8_t *frame, size_t len, struct native_message *ret, char error[128]);
 void native_message_finish(struct native_message *);

@@ -72,9 +72,9 @@ static int write_all(int fd, const uint8_t *data, size_t len)
 }
 
 /* The name after the rename outlives a power loss only if the bytes were on the disk before it. */
-static int write_file(const char *path, const struct buffer *bytes)
+int archive_write_file(const char *path, const struct buffer *bytes)
 {
-	char beside[CONFIG_TEXT_MAX + 96];
+	char beside[CONFIG_TEXT_MAX + 160];
 	int fd, r;
 
 	snprintf(beside, sizeof(beside), "%s.part", path);
@@ -126,7 +126,7 @@ static int save(struct job *job)
 	job->triangles = model.nt;
 	ply_write(&model, false, &bytes);
 	model_finish(&model);
-	r = bytes.error ? bytes.error : write_file(job->path, &bytes);
+	r = bytes.error ? bytes.error : archive_write_file(job->path, &bytes);
 	buffer_finish(&bytes);
 	return r;
 }

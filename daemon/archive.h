@@ -30,4 +30,7 @@ void archive_destroy(struct archive *); /* once the loop has run dry */
 /* Takes `old` over, whatever comes. False with a sentence: it is not saved. */
 bool archive_save(struct archive *, const uint8_t map_id[16], struct publisher_old *old, char error[200]);
 
+/* Writes a file beside `path` and renames it. 0 or -errno. Any thread. */
+int archive_write_file(const char *path, const struct buffer *);
+
 #endif

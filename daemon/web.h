@@ -54,16 +54,25 @@ struct web_language {
 	void (*close)(void *state); /* the connection is gone, whoever ended it */
 };
 
-/* Listens where listen.http says. NULL with one sentence that names the address and what to do; the sentence is empty where
- * listen.http is. -EADDRINUSE in `ret_errno` if somebody is there already. */
-struct web *web_create(uv_loop_t *, const struct config *, struct publisher *, const struct server_host *,
-                       int *ret_errno, char error[320]);
+struct snapshots;
+struct web_host {
+	struct server_host server;
+	void (*metrics)(void *ctx, struct buffer *ret); /* the status as text for Prometheus */
+	struct snapshots *snapshots;
+	bool replays; /* playback may be commanded on loopback */
+};
+
+/* Listens where listen.http says. NULL with one sentence that names the address and what to do, and 0 or -errno of why:
+ * -EADDRINUSE if somebody is there already, 0 and no sentence where listen.http is empty. */
+struct web *web_create(uv_loop_t *, const struct config *, struct publisher *, const struct web_host *, int *ret_why,
+                       char error[320]);
+/* Adds a language; before web_start. */
+void web_speak(struct web *, const struct web_language *, void *ctx);
+/* Lets clients in. 0 or -errno with a sentence. */
+int web_start(struct web *, char error[320]);
 /* Closes everything; the loop must run until nothing is left of it, then destroy. */
 void web_stop(struct web *);
 void web_destroy(struct web *);
-
-/* Languages are added before the loop runs. */
-void web_speak(struct web *, const struct web_language *, void *ctx);
 
 /* All of these take a NULL web, and do nothing then. */
 void web_wake(struct web *);                                                    /* the publisher has news */
@@ -75,7 +84,9 @@ bool web_loopback(const struct web *);
 /* For languages. */
 void web_wake_one(struct web_connection *); /* `next` has something, or soon may */
 const struct web_rights *web_rights(const struct web_connection *);
-const struct server_host *web_host(const struct web_connection *);
+const struct server_host *web_server_host(const struct web_connection *);
+const struct buffer *web_status(const struct web_connection *); /* the newest STATUS */
+void web_forget_status(const struct web_connection *);          /* it was changed: the next one is built anew */
 struct publisher *web_publisher(const struct web_connection *);
 /* While on, nothing is heard of the client; its own sends then block, nobody else's. For one that does not read answers. */
 void web_hold(struct web_connection *, bool on);

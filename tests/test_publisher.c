@@ -392,7 +392,7 @@ static void a_list_of_pins_is_counted_and_never_longer_than_64_kb(void **state)
 		write_some(client, 40000); /* begins a batch, then stalls */
 		publisher_stats(p, &all);
 		bytes = all.pinned;
-		publish_many(p, step, 2600, 1);
+		publish_many(p, step, 2300, 1);
 		publisher_client_stats(client, &stats);
 		publisher_stats(p, &all);
 		assert_int_equal(stats.aborts, step / 2 - 1);
@@ -661,7 +661,7 @@ static void what_is_wanted_and_not_served_is_said(void **state)
 	static struct history h;
 	struct publisher *p = start(&h, 50, 0);
 	struct reader reader = {0};
-	struct native_want want = {.flags = 4, .region = {0, 0, 0, 1, 1, 1}};
+	struct native_want want = {.flags = NATIVE_WANT_CODED};
 
 	(void)state;
 	random_state = 3;

@@ -1,0 +1,252 @@
+/* The wire of the native protocol: a walk as frames, with HELLO before it, JSON messages between, and a limited rate.
+ *
+ * Frames are gathered in a small buffer, so that a batch of many small ones is few writes; what does not fit in is taken
+ * over piece by piece from the sheet, which is not copied for the client. Nothing else queues: the next frame is chosen
+ * when there is room for it. */
+#include "daemon/publisher_client.h"
+
+#include <assert.h>
+#include <errno.h>
+#include <stdio.h>
+#include <stdlib.h>
+#include <string.h>
+
+struct native_stream *native_stream_create(void)
+{
+	return calloc(1, sizeof(struct native_stream));
+}
+
+void native_stream_destroy(struct native_stream *stream)
+{
+	if (!stream)
+		return;
+	buffer_finish(&stream->small);
+	buffer_finish(&stream->json);
+	free(stream);
+}
+
+/* Frames */
+
+static void send_small(struct native_stream *stream)
+{
+	stream->source = stream->small.data;
+	stream->source_left = stream->small.len;
+	if (stream->small.error) {
+		stream->source_left = 0;
+		stream->broken = true;
+	}
+}
+
+static void send_hello(struct publisher_client *client, int64_t t_ns)
+{
+	const struct publisher *p = client->publisher;
+	struct native_hello hello = {.major = NATIVE_MAJOR,
+	                             .minor = NATIVE_MINOR,
+	                             .generation = p->generation,
+	                             .cell_m = p->params.cell_m,
+	                             .step = p->step,
+	                             .t_ns = t_ns};
+
+	memcpy(hello.map_id, p->params.map_id, sizeof(hello.map_id));
+	native_put_hello(&client->stream->small, &hello);
+	send_small(client->stream);
+	client->stream->greeted = p->generation;
+}
+
+static void send_reason(struct publisher_client *client)
+{
+	struct native_stream *stream = client->stream;
+	char text[256];
+	int n = snprintf(text, sizeof(text), "{\"class\":\"ERROR\",\"error\":\"%s\"}", client->reason);
+
+	if (stream->greeted != client->publisher->generation)
+		stream->json.len = 0; /* answers come after HELLO, which it will not get */
+	native_put_json(&stream->small, text, (size_t)n);
+	send_small(stream);
+	stream->reason_sent = true;
+}
+
+static void send_json(struct native_stream *stream)
+{
+	struct buffer empty = stream->small;
+
+	stream->small = stream->json;
+	stream->json = empty;
+	stream->json.len = 0;
+	send_small(stream);
+}
+
+static bool send_begin(struct publisher_client *client)
+{
+	struct native_begin begin;
+	int r = publisher_walk_begin(client, &begin);
+
+	if (r < 0)
+		publisher_dismiss(client, "no memory for a batch");
+	if (r <= 0)
+		return r < 0;
+	native_put_begin(&client->stream->small, &begin);
+	send_small(client->stream);
+	return true;
+}
+
+static void send_item(struct publisher_client *client)
+{
+	struct native_stream *stream = client->stream;
+	struct publisher_item item;
+	int r = publisher_walk_next(client, &item);
+
+	if (r == 1 && !item.removed) {
+		stream->source = item.bytes;
+		stream->source_left = item.len;
+		return;
+	}
+	if (r == 1)
+		native_put_remove(&stream->small, item.key);
+	else
+		native_put_step(&stream->small, r == 0 ? NATIVE_COMMIT : NATIVE_ABORT, client->batch_step);
+	if (r == 0)
+		publisher_walk_commit(client);
+	if (r == -ENOMEM)
+		publisher_dismiss(client, "no memory for a batch");
+	send_small(stream);
+}
+
+/* Chooses the next frame; false: nothing is to be sent now. An ABORT comes before everything that is no batch's. */
+static bool send_next(struct publisher_client *client, int64_t t_ns)
+{
+	struct native_stream *stream = client->stream;
+	bool greeted = stream->greeted == client->publisher->generation;
+
+	stream->small.len = 0;
+	publisher_client_let_go(client);
+	if (stream->broken)
+		return false;
+	if (stream->json.len > 0 && greeted)
+		send_json(stream);
+	else if (stream->reason_sent)
+		return false;
+	else if (client->state != CLIENT_IDLE)
+		send_item(client);
+	else if (client->dismissed)
+		send_reason(client);
+	else if (!greeted)
+		send_hello(client, t_ns);
+	else
+		return send_begin(client);
+	return true;
+}
+
+static void fill(struct publisher_client *client, int64_t t_ns)
+{
+	struct native_stream *stream = client->stream;
+
+	stream->out_at = stream->out_len = 0;
+	while (stream->out_len < STREAM_OUT_BYTES) {
+		size_t n = STREAM_OUT_BYTES - stream->out_len;
+
+		if (stream->source_left == 0 && !send_next(client, t_ns))
+			return;
+		if (n > stream->source_left)
+			n = stream->source_left;
+		memcpy(stream->out + stream->out_len, stream->source, n);
+		stream->out_len += n;
+		stream->source += n;
+		stream->source_left -= n;
+	}
+}
+
+/* The rate */
+
+size_t publisher_peek(struct publisher_client *client, int64_t t_ns, const uint8_t **ret)
+{
+	struct native_stream *stream = client->stream;
+	size_t n, burst = stream->bytes_per_s / 10 + 64;
+
+	if (stream->bytes_per_s && t_ns < stream->next_ns)
+		return 0;
+	if (stream->out_at == stream->out_len)
+		fill(client, t_ns);
+	n = stream->out_len - stream->out_at;
+	*ret = stream->out + stream->out_at;
+	return stream->bytes_per_s && n > burst ? burst : n;
+}
+
+void publisher_wrote(struct publisher_client *client, size_t n, int64_t t_ns)
+{
+	struct native_stream *stream = client->stream;
+
+	assert(n <= stream->out_len - stream->out_at);
+	stream->out_at += n;
+	client->stats.sent += n;
+	if (stream->bytes_per_s) {
+		int64_t from = stream->next_ns > t_ns ? stream->next_ns : t_ns;
+
+		stream->next_ns = from + (int64_t)(n * 1000000000ull / stream->bytes_per_s);
+	}
+}
+
+bool publisher_at_end_of_frame(const struct publisher_client *client)
+{
+	return client->stream->source_left == 0;
+}
+
+int64_t publisher_deadline(const struct publisher_client *client)
+{
+	return client->stream->bytes_per_s ? client->stream->next_ns : INT64_MAX;
+}
+
+/* Messages */
+
+size_t publisher_json_room(const struct publisher_client *client)
+{
+	size_t used = client->stream->json.len + NATIVE_HEAD + 1;
+
+	return used > PUBLISHER_JSON_MAX || client->dismissed ? 0 : PUBLISHER_JSON_MAX - used;
+}
+
+bool publisher_json(struct publisher_client *client, const char *text, size_t len)
+{
+	if (client->dismissed || len > publisher_json_room(client)) {
+		client->stats.skipped_json++;
+		return false;
+	}
+	native_put_json(&client->stream->json, text, len);
+	return true;
+}
+
+void publisher_ping(struct publisher_client *client)
+{
+	if (client->stream->json.len + NATIVE_HEAD <= PUBLISHER_JSON_MAX)
+		native_put_ping(&client->stream->json);
+}
+
+void native_stream_want(struct publisher_client *client, const struct native_want *want)
+{
+	static const char text[] =
+	    "{\"class\":\"NOTICE\",\"message\":\"this build codes no patches: they come plain\"}";
+	bool coded = want->flags & NATIVE_WANT_CODED;
+
+	client->stream->bytes_per_s = want->bytes_per_s;
+	client->form =
+	    coded && client->publisher->params.encoder[PUBLISHER_CODED].encode ? PUBLISHER_CODED : PUBLISHER_NATIVE;
+	if (coded && client->form != PUBLISHER_CODED)
+		publisher_json(client, text, sizeof(text) - 1);
+}
+
+/* The end */
+
+const char *publisher_reason(const struct publisher_client *client)
+{
+	if (client->dismissed)
+		return client->reason;
+	return client->stream && client->stream->broken ? "no memory for a message" : NULL;
+}
+
+bool publisher_done(const struct publisher_client *client)
+{
+	const struct native_stream *stream = client->stream;
+
+	return stream->broken || (stream->reason_sent && stream->source_left == 0 &&
+	                          stream->out_at == stream->out_len && stream->json.len == 0);
+}

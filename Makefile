@@ -29,7 +29,7 @@ $(error config=$(config) is not known; use release, debug, sanitize, thread or f
 endif
 
 # -ffp-contract=off: the same bytes on every machine (law L2).
-PACKAGES := libuv yaml-0.1 jansson libpng libmodbus libsystemd libzstd
+PACKAGES := libuv yaml-0.1 jansson libpng libmodbus libsystemd libzstd zlib
 have = $(shell pkg-config --exists $(1) 2>/dev/null && echo yes)
 # What can be left out, and what the build then says.
 ifeq ($(call have,libusb-1.0),yes)

@@ -161,7 +161,7 @@ void mcap_reader_destroy(struct mcap_reader *);
 int mcap_reader_next(struct mcap_reader *, struct mcap_item *ret);
 /* As above, but 0 also where the open chunk has no further message, which is then still open. */
 int mcap_reader_next_in_chunk(struct mcap_reader *, struct mcap_item *ret);
-/* Within an open chunk: where the next message is, and back there. */
+/* Within an open chunk: where the next message is, and back there; nothing happens where none is open. */
 size_t mcap_reader_tell(const struct mcap_reader *);
 void mcap_reader_return(struct mcap_reader *, size_t told);
 
@@ -169,6 +169,8 @@ void mcap_reader_rewind(struct mcap_reader *);
 /* To the first chunk in the file that holds a message of `log_ns` or later, by the heads of chunks alone; channels of files that
  * do not repeat them are taken from the summary. Where there is none: to the end of the data. 0 or -ENOMEM. */
 int mcap_reader_seek(struct mcap_reader *, int64_t log_ns);
+/* First and last log time by the heads of the chunks, nothing decompressed; how many chunks. */
+size_t mcap_reader_span(struct mcap_reader *, uint64_t *ret_start_ns, uint64_t *ret_end_ns);
 /* True where a footer ends the file and its summary is undamaged: nothing is missing. */
 bool mcap_reader_whole(const struct mcap_reader *);
 /* Channels seen so far, by id: the first at or after `id`; NULL: none. */

@@ -1,1 +1,278 @@
-import { Scene } from "three"; new Scene();
+// The page: joins what comes (link, mirror, live), what is seen (scene, robot, camera) and what a person does (panel, tools).
+import { ColorManagement, LinearSRGBColorSpace, Scene, WebGLRenderer } from 'three';
+import { Camera } from './camera.js';
+import { MODES } from './colours.js';
+import { Grid } from './grid.js';
+import { Link, takeToken } from './link.js';
+import { Live } from './live.js';
+import { lengthText, Measure, Picker, tell } from './measure.js';
+import { Mirror } from './mirror.js';
+import { FrameReader, writeWant } from './native.js';
+import { $, element, Panel, span } from './panel.js';
+import { Robot } from './robot.js';
+import { MapScene } from './scene.js';
+import { showBacks } from './shader.js';
+import { finish, stillCounts } from './still.js';
+import { Transport } from './transport.js';
+
+const query = new URLSearchParams(location.search), still = query.get('still') === '1';
+const STALE_S = 2, CLICK_PIXELS = 5, CLICK_MS = 500;
+
+ColorManagement.enabled = false; // display colours throughout: shader.js
+const renderer = new WebGLRenderer({ canvas: $('view'), antialias: true, alpha: true, powerPreference: 'high-performance' });
+renderer.outputColorSpace = LinearSRGBColorSpace;
+renderer.setClearAlpha(0);
+
+const token = takeToken();
+const scene = new Scene(), map = new MapScene(), grid = new Grid(), robot = new Robot(), measure = new Measure();
+const camera = new Camera($('view'), still), picker = new Picker(map), panel = new Panel();
+scene.add(grid.mesh, map.group, robot.group, measure.group);
+
+// ---- what comes ----
+
+const mirror = new Mirror((name, patch, before) => map.show(name, (patch ?? before).key, patch));
+let status = null, may = { change: false, play: false }, lost = null, reader, live = null;
+
+const hooks = {
+  open() {
+    lost = null;
+    mirror.reconnect();
+    reader = new FrameReader((type, payload) => take(type, payload));
+    link.send(writeWant());
+    link.send('?WATCH={"enable":true}');
+  },
+  bytes: (bytes) => reader.push(bytes),
+  text: (text) => hear(JSON.parse(text)),
+  lost(reason) {
+    lost = reason;
+  },
+};
+const link = new Link('/native', ['facetd.v1'], token, hooks);
+if (!still) live = new Live(token);
+
+function take(type, payload) {
+  const before = mirror.hello;
+  mirror.take(type, payload);
+  if (mirror.hello === before) return;
+  map.cell = mirror.hello.cell;
+  if (before && (before.map !== mirror.hello.map || before.generation !== mirror.hello.generation)) robot.trail.clear();
+}
+
+function hear(message) {
+  if (message.may) may = message.may;
+  if (message.class === 'STATUS') {
+    status = message;
+    panel.status(status);
+    transport.show(status.replay, may.play || may.change);
+    rights();
+  } else if (message.class === 'ERROR') panel.note(message.error, true);
+  else if (message.class === 'DEVICE') panel.note(`${message.name}: ${message.state}${message.message ? `: ${message.message}` : ''}`, message.state === 'backing off');
+  else if (message.class === 'JUMP') panel.note(`the pose jumped by ${message.distance.toFixed(2)} m (${message.done})`, true);
+  else if (message.class === 'RECORD' && message.file) panel.note(`${message.enable === false ? 'recorded' : 'recording'} ${message.file}`);
+}
+
+const say = (word, more) => link.send(`?${word}${more ? `=${JSON.stringify(more)}` : ''}`);
+const transport = new Transport(say);
+
+function rights() {
+  $('changes').hidden = !may.change;
+  $('pause').hidden = !!status.replay; // the transport has one
+  $('pause').setAttribute('aria-pressed', !!status.paused);
+  $('record').setAttribute('aria-pressed', !!status.recording);
+  $('record').hidden = !!status.replay;
+}
+
+// ---- what a person does ----
+
+let section = Infinity, measuring = false;
+
+function setSection(value) { // 0..1000 of the map's height
+  const { min, max } = map.bounds;
+  section = value >= 1000 || map.bounds.isEmpty() ? Infinity : min.z + (value / 1000) * (max.z - min.z);
+  map.material.uniforms.section.value = Math.min(section, 1e9);
+  $('section-at').textContent = section === Infinity ? 'off' : `${section.toFixed(2)} m`;
+}
+
+function setMode(id) {
+  const index = Math.max(0, MODES.findIndex((mode) => mode.id === id));
+  map.setMode(index);
+  $('mode').value = MODES[index].id;
+  legend();
+}
+
+function legend() {
+  const id = MODES[map.mode].id, counts = [];
+  if (id === 'class') for (const patch of mirror.patches.values()) for (const kind of patch.classes) counts[kind] = (counts[kind] ?? 0) + 1;
+  panel.legend(id, counts, map.material.uniforms.heights.value, map.material.uniforms.ageSpan.value);
+}
+
+function setCamera(mode) {
+  camera.setMode(mode);
+  for (const button of document.querySelectorAll('[data-camera]')) button.setAttribute('aria-pressed', button.dataset.camera === mode);
+  if (mode === 'follow' && !camera.robot) panel.note('where the robot is is not known yet');
+}
+
+function setMeasuring(on) {
+  measuring = on;
+  document.body.classList.toggle('measuring', on);
+  $('measure').setAttribute('aria-pressed', on);
+  $('hint').hidden = !on;
+  $('hint').textContent = 'Pick two points';
+  measure.clear();
+  $('pick').hidden = true;
+}
+
+function pickAt(clientX, clientY) {
+  const found = picker.pick((2 * clientX) / innerWidth - 1, 1 - (2 * clientY) / innerHeight, camera.current, section);
+  if (measuring) {
+    if (found) measure.add(found.point);
+    $('hint').hidden = measure.points.length === 2;
+    $('hint').textContent = measure.points.length === 1 ? 'Pick the second point' : 'Pick two points';
+    return;
+  }
+  measure.mark(found?.point ?? null);
+  $('pick').hidden = !found;
+  if (found)
+    $('pick-text').replaceChildren(...tell(found, mirror.planes).flatMap(([what, text]) => [element('dt', what), element('dd', text)]));
+}
+
+function listenForClicks(canvas) {
+  let down = null;
+  canvas.addEventListener('pointerdown', (event) => {
+    down = event.isPrimary && event.button === 0 ? event : null;
+    panel.open(false);
+    $('formats').hidden = true;
+  });
+  canvas.addEventListener('pointerup', (event) => {
+    const moved = down ? Math.hypot(event.clientX - down.clientX, event.clientY - down.clientY) : Infinity;
+    if (event.isPrimary && moved < CLICK_PIXELS && event.timeStamp - down.timeStamp < CLICK_MS) pickAt(event.clientX, event.clientY);
+    down = null;
+  });
+}
+
+function saveMenu() {
+  const at = $('save').getBoundingClientRect(), open = $('formats').hidden;
+  for (const item of document.querySelectorAll('[data-format]'))
+    item.href = `snapshot.${item.dataset.format}${token ? `?token=${encodeURIComponent(token)}` : ''}`;
+  Object.assign($('formats').style, { left: `${at.left + at.width / 2}px`, top: `${at.top - 8}px` });
+  $('formats').hidden = !open;
+  $('save').setAttribute('aria-expanded', open);
+}
+
+const flip = { wire: (on) => (map.material.uniforms.wire.value = on), edges: (on) => (map.material.uniforms.edges.value = on),
+  backs: (on) => showBacks(map.material, on), laser: (on) => (robot.shown.laser = on), robot: (on) => (robot.shown.robot = on),
+  trail: (on) => (robot.shown.trail = on) };
+const keys = { 1: () => setCamera('free'), 2: () => setCamera('follow'), 3: () => setCamera('top'), f: () => camera.home(),
+  m: () => setMeasuring(!measuring), w: () => $('wire').click(), e: () => $('edges').click(), l: () => $('laser').click(),
+  b: () => $('backs').click(), c: () => setMode(MODES[(map.mode + 1) % MODES.length].id),
+  ' ': () => (status?.replay ? $('play') : $('pause')).click(), Escape: () => { setMeasuring(false); $('formats').hidden = true; panel.open(false); } };
+
+function wireUp() {
+  for (const [id, act] of Object.entries(flip)) $(id).onchange = () => act($(id).checked);
+  for (const button of document.querySelectorAll('[data-camera]')) button.onclick = () => setCamera(button.dataset.camera);
+  $('mode').onchange = () => setMode($('mode').value);
+  $('section').oninput = () => setSection(+$('section').value);
+  $('home').onclick = () => { setCamera(camera.mode === 'top' ? 'top' : 'free'); camera.home(); };
+  $('measure').onclick = () => setMeasuring(!measuring);
+  $('save').onclick = saveMenu;
+  $('formats').onclick = () => ($('formats').hidden = true);
+  $('pause').onclick = () => may.change && say(status?.paused ? 'RESUME' : 'PAUSE');
+  $('record').onclick = () => say('RECORD', { enable: !status?.recording });
+  $('pick-close').onclick = () => { $('pick').hidden = true; measure.clear(); };
+  addEventListener('keydown', (event) => {
+    const typing = event.target.closest?.('select, input:not([type=checkbox]), button') && event.key === ' ';
+    if (event.ctrlKey || event.metaKey || event.altKey || typing || !keys[event.key]) return;
+    event.preventDefault();
+    keys[event.key]();
+  });
+  listenForClicks($('view'));
+}
+
+// ---- what is seen ----
+
+let before = performance.now(), frames = 0, second = before, received = 0, pictureAt = null, committed = 0;
+
+function resize() {
+  renderer.setPixelRatio(still ? 1 : Math.min(devicePixelRatio, 2));
+  renderer.setSize(innerWidth, innerHeight, false);
+  camera.resize(innerWidth, innerHeight);
+}
+
+function tellState(now) {
+  if (mirror.commits !== committed || (link.open && status)) {
+    committed = mirror.commits;
+    if (link.open) pictureAt = link.heard;
+  }
+  const age = pictureAt === null ? null : (now - pictureAt) / 1000;
+  if (!link.open) panel.state('lost', age === null ? 'no daemon, trying' : `reconnecting, picture is ${span(age)} old`);
+  else if (age === null) panel.state('wait', 'connecting');
+  else if (age > STALE_S) panel.state('wait', `picture is ${span(age)} old`);
+  else if (status?.paused) panel.state('paused', 'paused');
+  else if (status?.replay) panel.state('live', `replay, ${status.replay.state}`);
+  else panel.state('live', 'live');
+}
+
+function everySecond(now) {
+  if (now - second < 1000) return;
+  const seconds = (now - second) / 1000, total = link.received + (live?.link.received ?? 0);
+  panel.own({ triangles: mirror.triangles, bytesPerSecond: (total - received) / seconds, fps: frames / seconds });
+  [second, frames, received] = [now, 0, total];
+  legend();
+}
+
+function showLength() {
+  const at = measure.update(camera.current, innerWidth, innerHeight), { result } = measure;
+  $('length').hidden = !at;
+  if (!at) return;
+  $('length').style.left = `${at.x}px`;
+  $('length').style.top = `${at.y}px`;
+  const parts = ['x', 'y', 'z'].map((axis) => `${axis} ${lengthText(result[axis])}`).join('   ');
+  $('length').replaceChildren(lengthText(result.distance), element('small', parts));
+}
+
+// Times of the map are the robot's; between two messages its clock goes on with ours.
+function robotTime(now) {
+  return status && link.open && !status.replay ? status.t + (now - link.heard) / 1000 : map.latest;
+}
+
+function draw(dt, now) {
+  map.update(!mirror.batch, camera.current.position, still ? Infinity : undefined);
+  if (live) robot.update(live);
+  const place = live?.robot;
+  camera.update(map.bounds, place ? camera.free.position.clone().setFromMatrixPosition(place) : null, dt);
+  grid.update(map.bounds);
+  map.prepare(camera.current.position, still ? map.latest : robotTime(now));
+  renderer.render(scene, camera.current);
+}
+
+function frame(now) {
+  requestAnimationFrame(frame);
+  frames++;
+  draw(Math.min((now - before) / 1000, 0.25), now);
+  before = now;
+  showLength();
+  panel.servo(live?.scanners()[0]?.tilt ?? null);
+  transport.move();
+  tellState(performance.now());
+  everySecond(now);
+}
+
+function stillFrame() {
+  if (!mirror.commits || mirror.batch || !status) return setTimeout(stillFrame, 20);
+  map.update(true, camera.current.position, Infinity);
+  if (query.has('section')) setSection(1000 * +query.get('section'));
+  draw(0, 0);
+  draw(0, 0);
+  finish(stillCounts(mirror, map));
+  link.end();
+}
+
+wireUp();
+setMode(query.get('mode') ?? 'flat');
+setCamera(query.get('camera') ?? 'free');
+addEventListener('resize', resize);
+resize();
+document.body.classList.toggle('still', still);
+globalThis.viewer = { mirror, map, camera, live, robot, measure, counts: () => stillCounts(mirror, map), status: () => status };
+if (still) stillFrame();
+else requestAnimationFrame(frame);

@@ -1,0 +1,122 @@
+// Three ways to look: free (turn, pan, zoom), follow (the same, about the robot), top (a plan: north stays up). Until a
+// person touches it the camera frames the whole map, as it grows.
+import { MOUSE, OrthographicCamera, PerspectiveCamera, TOUCH, Vector3 } from 'three';
+import { OrbitControls } from 'three/examples/jsm/controls/OrbitControls.js';
+
+const VIEW = new Vector3(-0.62, -0.85, 0.98).normalize(); // from the south-west, above
+const EASE_S = 0.25;
+
+export class Camera {
+  constructor(element, still) {
+    this.element = element;
+    this.free = new PerspectiveCamera(42, 1, 0.05, 2000);
+    this.top = new OrthographicCamera(-1, 1, 1, -1, 0.1, 4000);
+    this.free.up.set(0, 0, 1);
+    this.top.up.set(0, 1, 0);
+    this.free.position.copy(VIEW).multiplyScalar(14);
+    this.turn = new OrbitControls(this.free, element);
+    this.plan = new OrbitControls(this.top, element);
+    this.plan.enableRotate = false;
+    this.plan.mouseButtons = { LEFT: MOUSE.PAN, MIDDLE: MOUSE.DOLLY, RIGHT: MOUSE.PAN };
+    this.plan.touches = { ONE: TOUCH.PAN, TWO: TOUCH.DOLLY_PAN };
+    this.plan.screenSpacePanning = true;
+    for (const controls of [this.turn, this.plan]) {
+      controls.enableDamping = !still;
+      controls.dampingFactor = 0.12;
+      controls.zoomToCursor = true;
+      controls.addEventListener('start', () => (this.touched = true));
+    }
+    this.turn.maxPolarAngle = Math.PI * 0.94;
+    this.turn.minDistance = 0.3;
+    this.still = still;
+    this.touched = false;
+    this.robot = null;
+    this.spread = 8; // m from side to side, of the plan
+    this.setMode('free');
+  }
+
+  get current() {
+    return this.mode === 'top' ? this.top : this.free;
+  }
+
+  setMode(mode) {
+    this.mode = mode;
+    this.turn.enabled = mode !== 'top';
+    this.plan.enabled = mode === 'top';
+    this.touched = mode === 'follow';
+    if (mode === 'follow' && this.robot) this.approach = 1;
+  }
+
+  // Frames the map again.
+  home() {
+    if (this.mode === 'follow') this.setMode('free');
+    this.touched = false;
+    this.top.zoom = 1;
+  }
+
+  resize(width, height) {
+    this.free.aspect = width / height;
+    this.free.updateProjectionMatrix();
+    this.ratio = width / height;
+    this.frameTop();
+  }
+
+  frameTop() {
+    const half = this.spread / 2, [x, y] = this.ratio > 1 ? [half * this.ratio, half] : [half, half / this.ratio];
+    Object.assign(this.top, { left: -x, right: x, top: y, bottom: -y });
+    this.top.updateProjectionMatrix();
+  }
+
+  // `robot`: where it is (a Vector3) or null; `bounds` of the map; `dt` since the last frame, s.
+  update(bounds, robot, dt) {
+    if (!this.touched && !bounds.isEmpty()) this.frame(bounds, this.still ? 1 : 1 - Math.exp(-dt / EASE_S));
+    if (this.mode === 'follow' && robot) this.follow(robot, dt);
+    this.robot = robot?.clone() ?? null;
+    (this.mode === 'top' ? this.plan : this.turn).update(dt);
+  }
+
+  frame(bounds, share) {
+    const centre = bounds.getCenter(new Vector3());
+    if (this.mode === 'top') {
+      const size = bounds.getSize(new Vector3());
+      const spread = 1.12 * Math.max(4, this.ratio > 1 ? Math.max(size.y, size.x / this.ratio)
+        : Math.max(size.x, size.y * this.ratio));
+      this.spread += (spread - this.spread) * share;
+      this.frameTop();
+      this.plan.target.lerp(centre, share);
+      this.top.position.copy(this.plan.target).setZ(bounds.max.z + 100);
+      return;
+    }
+    const distance = this.distanceFor(bounds, centre);
+    this.turn.target.lerp(centre, share);
+    const wanted = centre.clone().addScaledVector(VIEW, distance);
+    this.free.position.lerp(wanted, share);
+  }
+
+  // From how far all eight corners are in sight, with a margin.
+  distanceFor(bounds, centre) {
+    const right = new Vector3().crossVectors(new Vector3(0, 0, 1), VIEW).normalize(), up = new Vector3().crossVectors(VIEW, right);
+    const tanY = Math.tan((this.free.fov * Math.PI) / 360), tanX = tanY * this.free.aspect;
+    let distance = 3;
+    for (let i = 0; i < 8; i++) {
+      const corner = new Vector3(i & 1 ? bounds.max.x : bounds.min.x, i & 2 ? bounds.max.y : bounds.min.y,
+        i & 4 ? bounds.max.z : bounds.min.z).sub(centre);
+      const depth = corner.dot(VIEW);
+      distance = Math.max(distance, depth + (1.06 * Math.abs(corner.dot(right))) / tanX,
+        depth + (1.06 * Math.abs(corner.dot(up))) / tanY);
+    }
+    return distance;
+  }
+
+  follow(robot, dt) {
+    const share = this.robot && !this.approach ? 1 : 1 - Math.exp(-dt / EASE_S);
+    const step = robot.clone().sub(this.turn.target).multiplyScalar(share);
+    this.turn.target.add(step);
+    this.free.position.add(step);
+    if (this.approach) {
+      const arm = this.free.position.clone().sub(this.turn.target), length = arm.length();
+      this.free.position.copy(this.turn.target).addScaledVector(arm, 1 + (Math.min(length, 7) / length - 1) * share);
+      if (Math.abs(length - Math.min(length, 7)) < 0.1 && step.length() < 0.02) this.approach = 0;
+    }
+  }
+}

@@ -41,6 +41,10 @@ struct profile {
 	double first_rad, step_rad; /* bearing of beam 0 and from beam to beam; 0 is straight ahead, positive left */
 	float range_m[PROFILE_BEAMS_MAX];
 	uint8_t state[PROFILE_BEAMS_MAX]; /* enum beam_state */
+	/* How much came back, as the device counts it. For those who look on: the map knows nothing of it, so the assembler
+	 * neither keeps it nor has it in its snapshots. */
+	bool has_remission;
+	uint16_t remission[PROFILE_BEAMS_MAX];
 };
 
 /* The servo's angle at a time; right-handed about the tilt frame's y: positive looks down. Decoder -> assembler. */

@@ -295,6 +295,16 @@ static void fill_ranges(struct decoder *d, const struct cola_channel *c)
 	}
 }
 
+/* `c` NULL: it sends none. One of another length belongs to another raster. */
+static void fill_remission(struct decoder *d, const struct cola_channel *c)
+{
+	struct profile *p = &d->profile;
+
+	p->has_remission = c != NULL && c->n == p->n;
+	if (p->has_remission)
+		cola_channel_values(c, p->remission);
+}
+
 /* The raster and the times between beams; `t_ns` is what the stamp marks. */
 static void fill_profile(struct decoder *d, const struct cola_channel *c, int64_t t_ns)
 {
@@ -353,6 +363,7 @@ static void take_profile(struct decoder *d, const struct cola_scan *s, int64_t s
 		d->count[MALFORMED]++;
 	} else {
 		fill_profile(d, c, stamp_ns);
+		fill_remission(d, cola_scan_channel(s, "RSSI1"));
 		take_encoder(d, s, stamp_ns, sink);
 		d->count[PROFILES]++;
 		sink->profile(sink->ctx, d->device, &d->profile);

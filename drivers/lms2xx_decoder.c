@@ -199,6 +199,35 @@ static bool raster_of(const struct decoder *d, const struct lms2xx_scan *scan, s
 	return raster_by_count(d, scan->n, ret);
 }
 
+/* What a word has above its range: levels of reflectivity, or the flag of a reflector. Other modes tell fields and
+ * dazzling there, which are nothing of the surface. */
+static bool words_have_remission(int mode)
+{
+	return mode == 0x01 || mode == 0x03 || mode == 0x05;
+}
+
+static void fill_remission(struct decoder *d, const struct lms2xx_scan *scan, const struct raster *raster)
+{
+	struct profile *p = &d->profile;
+	const int bits = lms2xx_range_bits(d->mode);
+
+	p->has_remission = words_have_remission(d->mode) || scan->amplitudes > 0;
+	if (!p->has_remission)
+		return;
+	for (unsigned i = 0; i < p->n; i++) {
+		const unsigned at = i + (unsigned)raster->skip;
+		const uint8_t *word = scan->value + at * scan->stride;
+		const unsigned beam = at + 1; /* as the scanner counts */
+
+		if (scan->amplitudes == 0)
+			p->remission[i] = (uint16_t)((word[0] | word[1] << 8) >> bits);
+		else if (beam >= scan->start && beam - scan->start < scan->amplitudes)
+			p->remission[i] = scan->amplitude[beam - scan->start];
+		else
+			p->remission[i] = 0;
+	}
+}
+
 static void fill_profile(struct decoder *d, const struct lms2xx_scan *scan, const struct raster *raster, double unit_m)
 {
 	struct profile *p = &d->profile;
@@ -217,6 +246,7 @@ static void fill_profile(struct decoder *d, const struct lms2xx_scan *scan, cons
 		p->state[i] = (uint8_t)lms2xx_range((uint16_t)(word[0] | word[1] << 8), d->mode, &range);
 		p->range_m[i] = p->state[i] == BEAM_OK ? (float)(range * unit_m) : 0;
 	}
+	fill_remission(d, scan, raster);
 }
 
 /* Scans a second that the line lets through: while one is on its way, those that end are skipped. */

@@ -209,7 +209,9 @@ bool lms2xx_decode_scan(const uint8_t *payload, size_t len, struct lms2xx_scan *
 	case LMS2XX_SCAN_REFLECTIVITY:
 		scan.start = get16(scan.value + 2 * n + 2);
 		scan.stop = get16(scan.value + 2 * n + 4);
-		bare += get16(scan.value + 2 * n) & 0x03FF;
+		scan.amplitudes = get16(scan.value + 2 * n) & 0x03FF;
+		scan.amplitude = scan.value + 2 * n + 6;
+		bare += scan.amplitudes;
 		break;
 	case LMS2XX_SCAN_RANGE:
 	case LMS2XX_SCAN_RANGE_MEAN:

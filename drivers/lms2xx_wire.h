@@ -100,7 +100,9 @@ struct lms2xx_scan {
 	uint8_t samples;      /* of a mean; else 0 */
 	uint8_t stride;       /* bytes from value to value */
 	const uint8_t *value; /* borrowed: n LE16 words */
-	bool indexed;         /* real-time indices follow the values */
+	uint16_t amplitudes;  /* of the echoes of beams start .. stop, which LMS2XX_SCAN_REFLECTIVITY adds */
+	const uint8_t *amplitude;
+	bool indexed; /* real-time indices follow the values */
 	uint8_t scan_index, telegram_index;
 	uint8_t status;
 };

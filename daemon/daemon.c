@@ -702,7 +702,13 @@ static bool begin_parts(struct daemon *d)
 	                                       .memory = config->map.memory},
 	                               .ready = on_worker_ready,
 	                               .ctx = &d->results};
-	struct pipeline_sink sink = {d, take_row, on_not_applied, on_flush, on_reply, on_data, on_jump};
+	struct pipeline_sink sink = {.ctx = d,
+	                             .row = take_row,
+	                             .not_applied = on_not_applied,
+	                             .flush = on_flush,
+	                             .reply = on_reply,
+	                             .data = on_data,
+	                             .jump = on_jump};
 	struct supervisor_host host = {d, watch_device, on_record, log_device};
 
 	memcpy(publisher.map_id, d->map_id, sizeof(publisher.map_id));

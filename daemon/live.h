@@ -14,6 +14,9 @@ struct live;
 struct live *live_create(const struct config *); /* borrowed; NULL when memory is out */
 void live_destroy(struct live *);
 
+/* Called after every tap: somebody may have news. One listener. */
+void live_listen(struct live *, void (*changed)(void *ctx), void *ctx);
+
 /* Taps; `device` is an index into config->device. Copied. */
 void live_profile(struct live *, int device, const struct profile *);
 void live_tilt(struct live *, int device, const struct tilt *);

@@ -74,6 +74,8 @@ static void on_profile(void *ctx, int device, const struct profile *profile)
 		scanner->arrivals++;
 		sweep_profile(scanner->sweep, profile, p->log_ns);
 	}
+	if (p->sink.profile)
+		p->sink.profile(p->sink.ctx, device, profile);
 	if (p->sink.data)
 		p->sink.data(p->sink.ctx, device, p->log_ns);
 }
@@ -85,6 +87,8 @@ static void on_tilt(void *ctx, int device, const struct tilt *tilt)
 	for (int i = 0; i < p->scanners; i++)
 		if (p->scanner[i].tilt_device == device)
 			sweep_tilt(p->scanner[i].sweep, tilt);
+	if (p->sink.tilt)
+		p->sink.tilt(p->sink.ctx, device, tilt);
 	if (p->sink.data && p->device[device].driver->role != ROLE_LASER) /* an encoder's ticks came with a profile */
 		p->sink.data(p->sink.ctx, device, p->log_ns);
 }
@@ -93,6 +97,8 @@ static void take_track(struct pipeline *p, int device, const struct pose_track_o
 {
 	for (int i = 0; i < p->scanners && out->has_pose; i++)
 		sweep_pose(p->scanner[i].sweep, &out->pose);
+	if (p->sink.pose && out->has_pose)
+		p->sink.pose(p->sink.ctx, &out->pose);
 	if (out->has_jump) {
 		p->jump.seen = true;
 		p->jump.device = device;

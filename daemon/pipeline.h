@@ -28,6 +28,10 @@ struct pipeline_sink {
 	/* The pose of `device` jumped. Said once the record in which it did is handled whole: with `new_map` its rows were
 	 * the old map's last ones, and what comes belongs to the new one (pipeline_reset). May be NULL. */
 	void (*jump)(void *ctx, int device, const struct pose_jump *);
+	/* For those who look on (daemon/live.h): what was measured, in the order of the records. Each may be NULL. */
+	void (*profile)(void *ctx, int device, const struct profile *);
+	void (*tilt)(void *ctx, int device, const struct tilt *);
+	void (*pose)(void *ctx, const struct pose *); /* of the robot, as the assemblers are told it */
 };
 
 /* NULL when memory is out. The configuration is borrowed and must outlive the pipeline; its drivers are known ones. */

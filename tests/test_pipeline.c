@@ -238,7 +238,13 @@ static void on_jump(void *ctx, int device, const struct pose_jump *jump)
 
 static void open_outcome(struct outcome *o)
 {
-	struct pipeline_sink sink = {o, on_row, on_not_applied, on_flush, on_reply, on_data, on_jump};
+	struct pipeline_sink sink = {.ctx = o,
+	                             .row = on_row,
+	                             .not_applied = on_not_applied,
+	                             .flush = on_flush,
+	                             .reply = on_reply,
+	                             .data = on_data,
+	                             .jump = on_jump};
 
 	memset(o, 0, sizeof(*o));
 	o->pipeline = pipeline_create(&config, &sink);

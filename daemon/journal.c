@@ -31,7 +31,6 @@
 
 static const char MAGIC[8] = "FACETJ2\n", OLDER[8] = "FACETJ1\n";
 
-enum { ENTRY_SNAPSHOT = 1, ENTRY_RECORD, ENTRY_TICK, ENTRY_NOT_APPLIED, ENTRY_CLOCK };
 enum { RECORD_HEAD = 8 + 8 + 1 + 1 + 4, RECORD_BYTES_MAX = 1 << 20, SNAPSHOT_BYTES_MAX = 1 << 26 };
 
 struct journal {
@@ -65,23 +64,23 @@ static void keep_record(void *ctx, const struct record *record)
 	head[16] = (uint8_t)record->device;
 	head[17] = (uint8_t)record->direction;
 	memcpy(head + 18, &n, 4);
-	put_entry(ctx, ENTRY_RECORD, head, sizeof(head));
+	put_entry(ctx, JOURNAL_RECORD, head, sizeof(head));
 	put(ctx, record->bytes, record->len);
 }
 
 static void keep_tick(void *ctx, int64_t log_ns)
 {
-	put_entry(ctx, ENTRY_TICK, &log_ns, 8);
+	put_entry(ctx, JOURNAL_TICK, &log_ns, 8);
 }
 
 static void keep_not_applied(void *ctx, uint64_t number)
 {
-	put_entry(ctx, ENTRY_NOT_APPLIED, &number, 8);
+	put_entry(ctx, JOURNAL_NOT_APPLIED, &number, 8);
 }
 
 static void keep_clock(void *ctx, int64_t ahead_ns)
 {
-	put_entry(ctx, ENTRY_CLOCK, &ahead_ns, 8);
+	put_entry(ctx, JOURNAL_CLOCK, &ahead_ns, 8);
 }
 
 /* 0, or -errno: there is no file then. */
@@ -117,7 +116,7 @@ static void keep_begin(void *ctx, const void *snapshot, size_t len)
 	if (journal->error == 0 && !journal->file)
 		journal->error = journal->lists > JOURNAL_FILES_MAX ? -EMFILE : open_list(journal, journal->lists);
 	put(journal, MAGIC, sizeof(MAGIC));
-	put_entry(journal, ENTRY_SNAPSHOT, &n, 4);
+	put_entry(journal, JOURNAL_SNAPSHOT, &n, 4);
 	put(journal, snapshot, len);
 }
 
@@ -178,27 +177,29 @@ int journal_error(const struct journal *journal)
 
 /* Feeding */
 
-struct entry {
-	uint8_t kind;
-	const uint8_t *data; /* after the kind */
-	size_t len;          /* with the kind */
-};
+int journal_is(const uint8_t *data, size_t len)
+{
+	if (len < sizeof(MAGIC))
+		return -EINVAL;
+	if (memcmp(data, MAGIC, sizeof(MAGIC)) == 0)
+		return 0;
+	return memcmp(data, OLDER, sizeof(OLDER)) == 0 ? -ENOTSUP : -EINVAL;
+}
 
-/* 1; 0 at the end (also within an entry); -EINVAL: no such entry. */
-static int entry_at(const uint8_t *data, size_t len, struct entry *ret)
+int journal_entry_at(const uint8_t *data, size_t len, struct journal_entry *ret)
 {
 	static const struct {
 		size_t fixed, max; /* what ends with a count has so many bytes behind it at most */
-	} kind[] = {[ENTRY_SNAPSHOT] = {4, SNAPSHOT_BYTES_MAX},
-	            [ENTRY_RECORD] = {RECORD_HEAD, RECORD_BYTES_MAX},
-	            [ENTRY_TICK] = {8, 0},
-	            [ENTRY_NOT_APPLIED] = {8, 0},
-	            [ENTRY_CLOCK] = {8, 0}};
+	} kind[] = {[JOURNAL_SNAPSHOT] = {4, SNAPSHOT_BYTES_MAX},
+	            [JOURNAL_RECORD] = {RECORD_HEAD, RECORD_BYTES_MAX},
+	            [JOURNAL_TICK] = {8, 0},
+	            [JOURNAL_NOT_APPLIED] = {8, 0},
+	            [JOURNAL_CLOCK] = {8, 0}};
 	uint32_t n = 0;
 
 	if (len == 0)
 		return 0;
-	if (data[0] < ENTRY_SNAPSHOT || data[0] > ENTRY_CLOCK)
+	if (data[0] < JOURNAL_SNAPSHOT || data[0] > JOURNAL_CLOCK)
 		return -EINVAL;
 	if (len < 1 + kind[data[0]].fixed)
 		return 0;
@@ -208,7 +209,7 @@ static int entry_at(const uint8_t *data, size_t len, struct entry *ret)
 		return -EINVAL;
 	if (len < 1 + kind[data[0]].fixed + n)
 		return 0;
-	*ret = (struct entry){data[0], data + 1, 1 + kind[data[0]].fixed + n};
+	*ret = (struct journal_entry){data[0], data + 1, 1 + kind[data[0]].fixed + n};
 	return 1;
 }
 
@@ -228,10 +229,10 @@ static int damaged(const struct feed *feed, const char *what)
 /* Tells the pipeline the rows not applied. */
 static void feed_skips(const uint8_t *data, size_t len, struct pipeline *pipeline)
 {
-	struct entry entry;
+	struct journal_entry entry;
 
-	while (entry_at(data, len, &entry) == 1) {
-		if (entry.kind == ENTRY_NOT_APPLIED) {
+	while (journal_entry_at(data, len, &entry) == 1) {
+		if (entry.kind == JOURNAL_NOT_APPLIED) {
 			uint64_t number;
 
 			memcpy(&number, entry.data, 8);
@@ -242,7 +243,7 @@ static void feed_skips(const uint8_t *data, size_t len, struct pipeline *pipelin
 	}
 }
 
-static int feed_snapshot(struct feed *feed, const struct entry *entry)
+static int feed_snapshot(struct feed *feed, const struct journal_entry *entry)
 {
 	struct state s;
 
@@ -268,24 +269,31 @@ static int take_log_time(struct feed *feed, const uint8_t *data)
 	return 0;
 }
 
-static int feed_record(struct feed *feed, const struct entry *entry)
+void journal_record(const struct journal_entry *entry, struct record *ret)
 {
-	struct record record = {.device = entry->data[16], .direction = (enum direction)entry->data[17]};
+	memcpy(&ret->log_ns, entry->data, 8);
+	memcpy(&ret->t_ns, entry->data + 8, 8);
+	ret->device = entry->data[16];
+	ret->direction = (enum direction)entry->data[17];
+	ret->bytes = entry->data + RECORD_HEAD;
+	ret->len = entry->len - 1 - RECORD_HEAD;
+}
+
+static int feed_record(struct feed *feed, const struct journal_entry *entry)
+{
+	struct record record;
 	int r = take_log_time(feed, entry->data);
 
 	if (r < 0)
 		return r;
-	record.log_ns = feed->log_ns;
-	memcpy(&record.t_ns, entry->data + 8, 8);
+	journal_record(entry, &record);
 	if (record.device >= feed->devices || record.direction > LINK_OPENED || !is_time(record.t_ns))
 		return damaged(feed, "a record of a device that is not there; the list is damaged");
-	record.bytes = entry->data + RECORD_HEAD;
-	record.len = entry->len - 1 - RECORD_HEAD;
 	pipeline_handle(feed->pipeline, &record);
 	return 0;
 }
 
-static int feed_tick(struct feed *feed, const struct entry *entry)
+static int feed_tick(struct feed *feed, const struct journal_entry *entry)
 {
 	int r = take_log_time(feed, entry->data);
 
@@ -294,7 +302,7 @@ static int feed_tick(struct feed *feed, const struct entry *entry)
 	return r;
 }
 
-static int feed_clock(struct feed *feed, const struct entry *entry)
+static int feed_clock(struct feed *feed, const struct journal_entry *entry)
 {
 	int64_t ahead_ns;
 
@@ -305,16 +313,16 @@ static int feed_clock(struct feed *feed, const struct entry *entry)
 	return 0;
 }
 
-static int feed_entry(struct feed *feed, const struct entry *entry)
+static int feed_entry(struct feed *feed, const struct journal_entry *entry)
 {
 	switch (entry->kind) {
-	case ENTRY_RECORD:
+	case JOURNAL_RECORD:
 		return feed_record(feed, entry);
-	case ENTRY_TICK:
+	case JOURNAL_TICK:
 		return feed_tick(feed, entry);
-	case ENTRY_CLOCK:
+	case JOURNAL_CLOCK:
 		return feed_clock(feed, entry);
-	case ENTRY_SNAPSHOT:
+	case JOURNAL_SNAPSHOT:
 		return damaged(feed, "a second beginning; the list is damaged");
 	default: /* rows not applied are known already */
 		return 0;
@@ -324,10 +332,10 @@ static int feed_entry(struct feed *feed, const struct entry *entry)
 /* A list cut within its snapshot is one of nothing: 0, as every other cut. */
 static int feed_all(struct feed *feed, const uint8_t *data, size_t len)
 {
-	struct entry entry;
-	int r = entry_at(data, len, &entry);
+	struct journal_entry entry;
+	int r = journal_entry_at(data, len, &entry);
 
-	if (r == 1 && entry.kind != ENTRY_SNAPSHOT)
+	if (r == 1 && entry.kind != JOURNAL_SNAPSHOT)
 		return damaged(feed, "no snapshot at the beginning; the list is damaged");
 	if (r == 1)
 		r = feed_snapshot(feed, &entry);
@@ -337,7 +345,7 @@ static int feed_all(struct feed *feed, const uint8_t *data, size_t len)
 	while (r == 0) {
 		data += entry.len;
 		len -= entry.len;
-		r = entry_at(data, len, &entry);
+		r = journal_entry_at(data, len, &entry);
 		if (r < 0)
 			return damaged(feed, "an unknown entry; the list is damaged");
 		if (r == 0)
@@ -375,11 +383,13 @@ int journal_feed(const char *path, struct pipeline *pipeline, char error[160])
 		snprintf(error, 160, "%.100s: cannot be read (%s)", path, strerror(-r));
 		return r;
 	}
-	r = -EINVAL;
-	if (len >= sizeof(MAGIC) && memcmp(data, MAGIC, sizeof(MAGIC)) == 0)
+	r = journal_is(data, len);
+	if (r == 0)
 		r = feed_all(&feed, data + sizeof(MAGIC), len - sizeof(MAGIC));
-	else if (len >= sizeof(MAGIC) && memcmp(data, OLDER, sizeof(OLDER)) == 0)
+	else if (r == -ENOTSUP)
 		snprintf(what, sizeof(what), "was written by an older facetd and cannot be read; keep it anew");
+	if (r == -ENOTSUP)
+		r = -EINVAL;
 	if (r < 0)
 		snprintf(error, 160, "%.60s: %.97s", path, what);
 	if (data)

@@ -33,4 +33,19 @@ int journal_error(const struct journal *);
  * The input is not ended: that is pipeline_end, the caller's. 0, or -EINVAL / -errno with a sentence. */
 int journal_feed(const char *path, struct pipeline *, char error[160]);
 
+/* Reading them entry by entry (daemon/replay.h, what feeds them above). */
+enum journal_kind { JOURNAL_SNAPSHOT = 1, JOURNAL_RECORD, JOURNAL_TICK, JOURNAL_NOT_APPLIED, JOURNAL_CLOCK };
+struct journal_entry {
+	uint8_t kind;
+	const uint8_t *data; /* after the kind, as journal.c draws it; borrowed */
+	size_t len;          /* with the kind: where the next one is */
+};
+#define JOURNAL_MAGIC 8 /* bytes before the first entry */
+/* 0; -EINVAL: no journal; -ENOTSUP: an older facetd's. */
+int journal_is(const uint8_t *data, size_t len);
+/* 1; 0 at the end (also within an entry); -EINVAL: no such entry. */
+int journal_entry_at(const uint8_t *data, size_t len, struct journal_entry *ret);
+/* Of a JOURNAL_RECORD that is whole; its device and direction are not judged. */
+void journal_record(const struct journal_entry *, struct record *ret);
+
 #endif

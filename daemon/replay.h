@@ -20,6 +20,7 @@ enum replay_kind {
 	REPLAY_CLOCK,       /* the wall clock was set: ahead_ns */
 	REPLAY_NOT_APPLIED, /* within sources only: replay_next says it in `skip` of the event before */
 	REPLAY_ROW,         /* a row of a scan that was never bytes of a device: its pipeline has no part in it */
+	REPLAY_END,         /* within sources only: the file was ended in order */
 	REPLAY_EVENT /* `bytes` is a JSON text: a device's state, for who looks on; the map knows nothing of it */
 };
 
@@ -29,6 +30,8 @@ struct replay_event {
 	struct record record; /* RECORD; its bytes are borrowed until the next call */
 	int64_t ahead_ns;     /* CLOCK */
 	bool goes_on;         /* BEGIN: of the same map (the next file of a rotation), if this is its state */
+	uint64_t session;     /* BEGIN: of the recorder; 0: not known. `part` N + 1 goes on where part N was ended */
+	uint32_t part;
 	const uint8_t *bytes; /* BEGIN, EVENT; borrowed likewise */
 	size_t len;
 	uint64_t number;      /* NOT_APPLIED */
@@ -62,6 +65,10 @@ int64_t replay_next_ns(const struct replay *);
 int replay_back(struct replay *, int64_t t_ns, char error[REPLAY_ERROR_MAX]);
 /* Log time of that beginning. */
 int64_t replay_back_ns(const struct replay *, int64_t t_ns);
+
+/* Is the end of the files that of the input, so that what waits is handed out (pipeline_end)? Not of a recording: its end
+ * is the moment at which nobody listened any more, and the map is the one that the daemon's clients held then. */
+bool replay_ends(const struct replay *);
 
 /* What an importer found and left, e.g. "12 of 4000 frames belong to no device"; empty: nothing. */
 const char *replay_note(const struct replay *);

@@ -17,7 +17,7 @@ static const struct command commands[] = {
     {"picture", "a mesh as a picture, from above with the ceiling cut off", picture_main},
     {"simulate", "simulated devices, and what to try on them", simulate_main},
     {"record", "record a running daemon", NULL},
-    {"replay", "a recording into a mesh", NULL},
+    {"replay", "a recording into a mesh", replay_main},
     {"info", "what is in a recording, scan or mesh", NULL},
     {"repair", "what is whole of a cut recording", NULL},
     {"devices", "what is plugged in, with the configuration for each", devices_main},

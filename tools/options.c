@@ -45,7 +45,7 @@ static const struct argp_option table[] = {
     {0},
 };
 
-static void __attribute__((noreturn, format(printf, 1, 2))) refuse(const char *format, ...)
+void options_refuse(const char *format, ...)
 {
 	va_list args;
 	va_start(args, format);
@@ -56,43 +56,43 @@ static void __attribute__((noreturn, format(printf, 1, 2))) refuse(const char *f
 	exit(2);
 }
 
-static double number(const char *option, const char *word, double min, double max)
+double options_number(const char *option, const char *word, double min, double max)
 {
 	struct text text;
 	double value;
 	text_init(&text, word, strlen(word));
 	if (!text_number(&text, &value) || !text_ended(&text) || !(value >= min && value <= max))
-		refuse("--%s %s: give a number from %g to %g", option, word, min, max);
+		options_refuse("--%s %s: give a number from %g to %g", option, word, min, max);
 	return value;
 }
 
 static int whole(const char *option, const char *word, int min, int max)
 {
-	double value = number(option, word, min, max);
+	double value = options_number(option, word, min, max);
 	if (value != (int)value)
-		refuse("--%s %s: give a whole number from %d to %d", option, word, min, max);
+		options_refuse("--%s %s: give a whole number from %d to %d", option, word, min, max);
 	return (int)value;
 }
 
 static bool on_off(const char *option, const char *word)
 {
 	if (strcmp(word, "on") != 0 && strcmp(word, "off") != 0)
-		refuse("--%s %s: give on or off", option, word);
+		options_refuse("--%s %s: give on or off", option, word);
 	return strcmp(word, "on") == 0;
 }
 
 static void field(const char *word)
 {
 	if (strcmp(word, "hoppe") == 0 || strcmp(word, "direct") == 0)
-		refuse("--field %s: comes in a later version, use --field distance", word);
+		options_refuse("--field %s: comes in a later version, use --field distance", word);
 	if (strcmp(word, "distance") != 0)
-		refuse("--field %s: there is no such field, use --field distance", word);
+		options_refuse("--field %s: there is no such field, use --field distance", word);
 }
 
 static void pose(struct options *options, int kind, const char *path)
 {
 	if (options->pose != POSE_BESIDE)
-		refuse("--pose, --no-pose and --poses exclude each other: give one of them, once");
+		options_refuse("--pose, --no-pose and --poses exclude each other: give one of them, once");
 	options->pose = kind;
 	options->pose_path = path;
 }
@@ -102,20 +102,24 @@ static error_t parse(int key, char *word, struct argp_state *state)
 	struct options *options = state->input;
 	switch (key) {
 	case KEY_CELL:
-		options->map.cell_m = number("cell", word, 0.005, 2);
+		options->given |= OPTION_CELL;
+		options->map.cell_m = options_number("cell", word, 0.005, 2);
 		return 0;
 	case KEY_TOLERANCE:
-		options->map.tolerance = number("tolerance", word, 0.01, 1);
+		options->given |= OPTION_TOLERANCE;
+		options->map.tolerance = options_number("tolerance", word, 0.01, 1);
 		return 0;
 	case KEY_SNAP:
-		options->snap = number("snap", word, 0, 0.5);
+		options->snap = options_number("snap", word, 0, 0.5);
 		return 0;
 	case KEY_REDUCE:
+		options->given |= OPTION_REDUCE;
 		options->map.reduce = on_off("reduce", word);
 		return 0;
 	case KEY_PLANES:
 		if (on_off("planes", word))
-			refuse("--planes on: the planes of the whole map come in a later version, use --planes off");
+			options_refuse(
+			    "--planes on: the planes of the whole map come in a later version, use --planes off");
 		return 0;
 	case KEY_FIELD:
 		field(word);
@@ -150,19 +154,33 @@ static error_t parse(int key, char *word, struct argp_state *state)
 	}
 }
 
-void options_parse(int argc, char **argv, const char *doc, struct options *ret)
+const struct argp options_argp = {.options = table, .parser = parse};
+
+void options_default(struct options *ret)
 {
-	const struct argp argp = {.options = table, .parser = parse, .args_doc = "-o OUT INPUT...", .doc = doc};
 	*ret = (struct options){
 	    .map = {.cell_m = 0.05, .tolerance = 0.25, .reduce = true, .lookahead = 2, .memory = MEMORY_MAX},
 	    .snap = 0.15,
 	    .threads = 1,
 	};
+}
+
+void options_check(const struct options *options, const char *command)
+{
+	if (options->inputs == 0)
+		options_refuse("no input: see facet %s --help", command);
+	if (!options->output)
+		options_refuse("no output: say where the mesh goes with -o OUT.ply (or .obj, .stl, .glb)");
+	if (output_format(options->output) == OUTPUT_UNKNOWN)
+		options_refuse("%s: the ending names no mesh format; use .ply, .obj, .stl or .glb", options->output);
+}
+
+void options_parse(int argc, char **argv, const char *doc, struct options *ret)
+{
+	const struct argp argp = {.options = table, .parser = parse, .args_doc = "-o OUT INPUT...", .doc = doc};
+	options_default(ret);
 	argp_parse(&argp, argc, argv, 0, NULL, ret);
 	if (ret->inputs == 0)
-		refuse("no input: name scans or clouds, see facet reconstruct --help");
-	if (!ret->output)
-		refuse("no output: say where the mesh goes with -o OUT.ply (or .obj, .stl, .glb)");
-	if (output_format(ret->output) == OUTPUT_UNKNOWN)
-		refuse("%s: the ending names no mesh format; use .ply, .obj, .stl or .glb", ret->output);
+		options_refuse("no input: name scans or clouds, see facet reconstruct --help");
+	options_check(ret, "reconstruct");
 }

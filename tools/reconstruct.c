@@ -15,7 +15,6 @@
 #include <stdlib.h>
 #include <string.h>
 #include <strings.h>
-#include <sys/resource.h>
 #include <sys/stat.h>
 #include <time.h>
 #include <unistd.h>
@@ -26,20 +25,13 @@
 #include "core/text.h"
 #include "core/trig.h"
 #include "tools/commands.h"
+#include "tools/figures.h"
 #include "tools/options.h"
 #include "tools/output.h"
 
 #define ROW_NS   100000000LL /* between the profiles of a scan; its servo stands while one is measured */
 #define BEAM_NS  37037
 #define FILE_MAX ((size_t)4 << 30)
-
-enum stage { READ, ASSEMBLE, INTEGRATE, EXTRACT, REDUCE, WRITE, STAGES };
-
-struct figures {
-	uint64_t points, rows, sweeps, blocks, patches, faces_raw, faces, planes;
-	double seconds[STAGES]; /* CPU */
-	char hash[65];
-};
 
 struct run {
 	struct options options;
@@ -83,17 +75,10 @@ static int complain_parse(const char *path, int r, const struct parse_error *err
 	return complain("%s: %s", path, error->text);
 }
 
-static double cpu_seconds(clockid_t clock)
-{
-	struct timespec t;
-	clock_gettime(clock, &t);
-	return (double)t.tv_sec + 1e-9 * (double)t.tv_nsec;
-}
-
 /* What this process has used since the last call goes to `stage`. */
 static void lap(struct run *run, enum stage stage)
 {
-	double now = cpu_seconds(CLOCK_PROCESS_CPUTIME_ID);
+	double now = figures_cpu(CLOCK_PROCESS_CPUTIME_ID);
 	run->figures.seconds[stage] += now - run->lap;
 	run->lap = now;
 }
@@ -483,13 +468,13 @@ static void *mesh_patches(void *arg)
 {
 	struct worker *worker = arg;
 	struct work *work = worker->work;
-	double begin = cpu_seconds(CLOCK_THREAD_CPUTIME_ID);
+	double begin = figures_cpu(CLOCK_THREAD_CPUTIME_ID);
 	for (size_t i; (i = atomic_fetch_add(&work->next, 1)) < work->n;) {
 		int r = map_extract(work->map, worker->mesher, work->key[i]);
-		double extracted = cpu_seconds(CLOCK_THREAD_CPUTIME_ID);
+		double extracted = figures_cpu(CLOCK_THREAD_CPUTIME_ID);
 		work->patch[i] = r == 0 ? map_reduce(work->map, worker->mesher) : NULL;
 		worker->failed |= !work->patch[i];
-		double reduced = cpu_seconds(CLOCK_THREAD_CPUTIME_ID);
+		double reduced = figures_cpu(CLOCK_THREAD_CPUTIME_ID);
 		worker->extract += extracted - begin;
 		worker->reduce += reduced - extracted;
 		begin = reduced;
@@ -524,17 +509,6 @@ static bool run_workers(struct run *run, struct work *work, struct worker *worke
 	return good;
 }
 
-static void count_patch(struct run *run, const struct patch *patch)
-{
-	uint32_t last = PLANE_NONE;
-	run->figures.patches++;
-	run->figures.faces += patch->nt;
-	for (uint32_t i = 0; i < patch->nruns; i++) {
-		run->figures.planes += patch->run[i].plane != PLANE_NONE && patch->run[i].plane != last;
-		last = patch->run[i].plane;
-	}
-}
-
 /* Puts what has a surface into the store; takes all patches over. */
 static bool keep_patches(struct run *run, struct patch **patch, size_t n)
 {
@@ -546,7 +520,7 @@ static bool keep_patches(struct run *run, struct patch **patch, size_t n)
 			patch_unref(patch[i]);
 			continue;
 		}
-		count_patch(run, patch[i]);
+		figures_patch(&run->figures, patch[i]);
 		good = patch_store_put(run->store, patch[i]) == 0;
 	}
 	return good;
@@ -560,7 +534,7 @@ static int make_mesh(struct run *run)
 	struct worker *worker = calloc((size_t)run->options.threads, sizeof *worker);
 	show_progress("meshing");
 	bool good = work.patch && worker && run_workers(run, &work, worker, run->options.threads);
-	run->lap = cpu_seconds(CLOCK_PROCESS_CPUTIME_ID); /* the threads have measured themselves */
+	run->lap = figures_cpu(CLOCK_PROCESS_CPUTIME_ID); /* the threads have measured themselves */
 	if (work.patch)
 		good &= keep_patches(run, work.patch, work.n);
 	free(work.patch);
@@ -584,37 +558,10 @@ static int write_mesh(struct run *run)
 	return r < 0 ? complain("%s", error.text) : 0;
 }
 
-static double reduction(const struct figures *f)
-{
-	return f->faces_raw ? 1 - (double)f->faces / (double)f->faces_raw : 0;
-}
-
 static int write_stats(struct run *run)
 {
-	const struct figures *f = &run->figures;
-	struct rusage usage;
 	struct output_error error;
-	struct buffer b = {0};
-	getrusage(RUSAGE_SELF, &usage);
-	buffer_printf(&b, "{\"points\": %llu, \"rows\": %llu, \"sweeps\": %llu, \"blocks\": %llu, \"patches\": %llu, ",
-	              (unsigned long long)f->points, (unsigned long long)f->rows, (unsigned long long)f->sweeps,
-	              (unsigned long long)f->blocks, (unsigned long long)f->patches);
-	buffer_printf(&b,
-	              "\"cells\": %llu, \"faces_raw\": %llu, \"faces\": %llu, \"planes\": %llu, \"reduction\": %.6f, ",
-	              (unsigned long long)f->blocks * BLOCK_VOXELS, (unsigned long long)f->faces_raw,
-	              (unsigned long long)f->faces, (unsigned long long)f->planes, reduction(f));
-	buffer_printf(&b, "\"batches\": 1, \"seconds\": {\"read\": %.6f, \"assemble\": %.6f, \"integrate\": %.6f, ",
-	              f->seconds[READ], f->seconds[ASSEMBLE], f->seconds[INTEGRATE]);
-	buffer_printf(&b, "\"extract\": %.6f, \"reduce\": %.6f, \"write\": %.6f, \"total\": %.6f}, ",
-	              f->seconds[EXTRACT], f->seconds[REDUCE], f->seconds[WRITE],
-	              cpu_seconds(CLOCK_PROCESS_CPUTIME_ID));
-	buffer_printf(&b, "\"peak_rss_bytes\": %llu, \"hash\": \"%s\"}\n", (unsigned long long)usage.ru_maxrss * 1024,
-	              f->hash);
-	int r = b.error ? -ENOMEM : output_write(run->options.stats, b.data, b.len, &error);
-	bool failed = b.error;
-	buffer_finish(&b);
-	if (failed)
-		return out_of_memory(run->options.stats);
+	int r = figures_write(&run->figures, run->options.stats, &error);
 	return r < 0 ? complain("%s", error.text) : 0;
 }
 
@@ -636,8 +583,8 @@ static void tell(const struct run *run)
 		fprintf(stderr, "facet: no surface was found in %llu points; use a larger --cell\n",
 		        (unsigned long long)f->points);
 	printf("%s: %llu faces of %llu (%.1f %% less), %llu points, %.2f s CPU\n", run->options.output,
-	       (unsigned long long)f->faces, (unsigned long long)f->faces_raw, 100 * reduction(f),
-	       (unsigned long long)f->points, cpu_seconds(CLOCK_PROCESS_CPUTIME_ID));
+	       (unsigned long long)f->faces, (unsigned long long)f->faces_raw, 100 * figures_reduction(f),
+	       (unsigned long long)f->points, figures_cpu(CLOCK_PROCESS_CPUTIME_ID));
 }
 
 static int check_outputs(const struct options *o)
@@ -672,7 +619,7 @@ int reconstruct_main(int argc, char **argv)
 	                          "clouds .pcd .ply .xyz .pts "
 	                          "in metres, whose points are taken as seen from the origin of their frame; --pose "
 	                          "places that frame in the map.";
-	struct run run = {0};
+	struct run run = {.figures.batches = 1};
 	options_parse(argc, argv, doc, &run.options);
 	int r = check_inputs(&run.options);
 	if (r == 0)
@@ -682,7 +629,7 @@ int reconstruct_main(int argc, char **argv)
 	if (r == 0) {
 		run.map = map_create(&run.options.map);
 		run.store = patch_store_create();
-		run.lap = cpu_seconds(CLOCK_PROCESS_CPUTIME_ID);
+		run.lap = figures_cpu(CLOCK_PROCESS_CPUTIME_ID);
 		r = run.map && run.store ? reconstruct(&run) : out_of_memory(run.options.output);
 	}
 	if (run.store)

@@ -19,7 +19,7 @@ static void wake(void *ctx)
 
 static void *open_listener(void *ctx, struct web_connection *connection, const char *name)
 {
-	const struct server_host *host = web_host(connection);
+	const struct server_host *host = web_server_host(connection);
 	const struct foxglove_wire wire = {connection, wake};
 	struct listener *listener = calloc(1, sizeof(*listener));
 	char encoding[16] = "";

@@ -38,6 +38,12 @@ OPTIONS += -DHAVE_USB
 else
 LEFT_OUT += 'scanners on USB (libusb-1.0-0-dev)'
 endif
+ifeq ($(call have,libwebsockets),yes)
+PACKAGES += libwebsockets
+OPTIONS += -DHAVE_WEB
+else
+LEFT_OUT += 'the page, snapshots, figures and WebSockets (libwebsockets-dev, libwebsockets-evlib-uv)'
+endif
 CFLAGS_ALL := -std=c17 -D_GNU_SOURCE -I. -I$(B)/gen -MMD -MP -Wall -Wextra -Wshadow -Wstrict-prototypes \
 	-Wmissing-prototypes -Wvla -ffp-contract=off -fno-strict-aliasing -pthread $(FLAGS_$(config)) $(OPTIONS) $(CFLAGS) \
 	$(shell pkg-config --cflags $(PACKAGES) 2>/dev/null)

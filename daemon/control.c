@@ -30,6 +30,11 @@ bool control_changes(enum control_word word)
 	return word == CONTROL_PAUSE || word == CONTROL_RESUME || word == CONTROL_RESET;
 }
 
+bool control_plays(enum control_word word)
+{
+	return word == CONTROL_PAUSE || word == CONTROL_RESUME;
+}
+
 static int refuse(char error[200], const char *sentence)
 {
 	snprintf(error, 200, "%s", sentence);
@@ -227,19 +232,25 @@ static json_t *integer(uint64_t value)
 	return json_integer((json_int_t)value);
 }
 
+const char *control_beam_name(enum beam_state state)
+{
+	static const char *const names[BEAM_STATES] = {"ok",           "no echo",       "dazzled",        "overflow",
+	                                               "weak",         "channel error", "beyond maximum", "reserved",
+	                                               "out of range", "masked",        "self",           "mixed"};
+
+	return names[state];
+}
+
 static json_t *rows_json(const struct control_status *s)
 {
 	json_t *dropped = json_object(), *beams = json_object();
-	static const char *const state[BEAM_STATES] = {"ok",           "no echo",       "dazzled",        "overflow",
-	                                               "weak",         "channel error", "beyond maximum", "reserved",
-	                                               "out of range", "masked",        "self",           "mixed"};
 
 	for (int i = 0; i < SWEEP_DROPS; i++)
 		json_object_set_new(dropped, sweep_drop_name((enum sweep_drop)i), integer(s->rows.sweep.dropped[i]));
 	json_object_set_new(dropped, "queue full", integer(s->rows.queue_full));
 	json_object_set_new(dropped, "paused", integer(s->rows.paused));
 	for (int i = 0; i < BEAM_STATES; i++)
-		json_object_set_new(beams, state[i], integer(s->rows.sweep.beams[i]));
+		json_object_set_new(beams, control_beam_name((enum beam_state)i), integer(s->rows.sweep.beams[i]));
 	return json_pack("{s:I, s:I, s:I, s:f, s:I, s:I, s:o, s:o}", "assembled", (json_int_t)s->rows.assembled,
 	                 "applied", (json_int_t)s->rows.applied, "not_applied", (json_int_t)s->rows.not_applied, "rate",
 	                 s->rows.rate, "profiles", (json_int_t)s->rows.sweep.profiles, "sweeps",

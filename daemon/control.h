@@ -23,6 +23,8 @@ int control_parse(const char *text, size_t len, struct control_command *ret, cha
 
 /* Commands that change something are for the unix socket only. */
 bool control_changes(enum control_word);
+/* ... and of these, those that only move the playback of a recording. */
+bool control_plays(enum control_word);
 const char *control_name(enum control_word);
 
 struct control_client {
@@ -75,6 +77,7 @@ void control_put_error(struct buffer *, const char *sentence);
 void control_put_device_event(struct buffer *, const char *device, const char *state, const char *text);
 /* The pose of `device` jumped. */
 void control_put_jump_event(struct buffer *, const char *device, const struct pose_jump *);
+const char *control_beam_name(enum beam_state);
 const char *control_on_jump(enum pose_track_on_jump); /* "keep", ... */
 /* A map ended, another began. */
 void control_put_map_event(struct buffer *, const uint8_t map_id[16], uint32_t generation, const uint8_t before[16]);

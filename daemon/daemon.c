@@ -30,8 +30,12 @@
 #include "daemon/notify.h"
 #include "daemon/publisher.h"
 #include "daemon/server.h"
+#include "daemon/snapshot.h"
 #include "daemon/supervisor.h"
 #include "daemon/wall_clock.h"
+#include "daemon/web.h"
+#include "daemon/web_metrics.h"
+#include "daemon/web_native.h"
 #include "daemon/worker.h"
 
 #define TICK_MS       100
@@ -60,6 +64,8 @@ struct daemon {
 	struct pipeline *pipeline;
 	struct supervisor *supervisor;
 	struct server *server;
+	struct web *web; /* NULL: there is none */
+	struct snapshots *snapshots;
 	struct archive *archive;
 	struct journal *journal;
 	struct journal_sink keep; /* empty without a journal */
@@ -116,6 +122,7 @@ static void tell_clients(struct daemon *d, struct buffer *message)
 {
 	if (d->server)
 		server_event(d->server, (const char *)message->data, message->len);
+	web_event(d->web, (const char *)message->data, message->len);
 	buffer_finish(message);
 }
 
@@ -381,6 +388,20 @@ static void on_saved(void *ctx, const struct archive_result *result)
 	tell_clients(d, &message);
 }
 
+static void on_snapshot_saved(void *ctx, const char *path, const char *error)
+{
+	struct daemon *d = ctx;
+	struct buffer message = {0};
+	char map[33];
+
+	for (int i = 0; i < 16; i++)
+		snprintf(map + 2 * i, 3, "%02x", d->map_id[i]);
+	log_line(path ? LOG_INFO : LOG_ERR, "%s %s",
+	         path ? "the map was saved as" : "the map was not saved:", path ? path : error);
+	control_put_saved_event(&message, map, path, path ? NULL : error);
+	tell_clients(d, &message);
+}
+
 /* Everything of the old map is with the publisher. */
 static void end_map(struct daemon *d)
 {
@@ -432,6 +453,7 @@ static void on_results(uv_async_t *async)
 	while (r == 0 && (result = worker_take(d->worker)) != NULL) {
 		r = publish(d, result);
 		server_wake(d->server);
+		web_wake(d->web);
 		note_latencies(d, result);
 		worker_result_destroy(result);
 	}
@@ -498,10 +520,17 @@ static size_t resident_bytes(void)
 	return resident * (size_t)sysconf(_SC_PAGESIZE);
 }
 
-static void put_status(void *ctx, struct buffer *ret)
+static size_t list_clients(const struct daemon *d, struct control_client client[CLIENTS_SHOWN])
 {
-	struct daemon *d = ctx;
-	struct control_client client[CLIENTS_SHOWN];
+	size_t n = server_clients(d->server, client, CLIENTS_SHOWN);
+
+	n = n < CLIENTS_SHOWN ? n : CLIENTS_SHOWN;
+	n += web_clients(d->web, client + n, CLIENTS_SHOWN - n);
+	return n < CLIENTS_SHOWN ? n : CLIENTS_SHOWN;
+}
+
+static void fill_status(struct daemon *d, struct control_client client[CLIENTS_SHOWN], struct control_status *ret)
+{
 	struct control_status s = {.client = client};
 	struct pipeline_stats rows;
 	struct publisher_stats map;
@@ -532,10 +561,29 @@ static void put_status(void *ctx, struct buffer *ret)
 	s.rss_bytes = resident_bytes();
 	fill_latency(d, &s);
 	fill_devices(d, &s);
-	s.clients = server_clients(d->server, client, CLIENTS_SHOWN);
-	if (s.clients > CLIENTS_SHOWN)
-		s.clients = CLIENTS_SHOWN;
+	s.clients = list_clients(d, client);
+	*ret = s;
+}
+
+static void put_status(void *ctx, struct buffer *ret)
+{
+	struct control_client client[CLIENTS_SHOWN];
+	struct control_status s;
+
+	fill_status(ctx, client, &s);
 	control_put_status(ret, &s);
+}
+
+static void put_metrics(void *ctx, struct buffer *ret)
+{
+	struct daemon *d = ctx;
+	struct control_client client[CLIENTS_SHOWN];
+	struct control_status s;
+	struct publisher_stats map;
+
+	fill_status(d, client, &s);
+	publisher_stats(d->publisher, &map);
+	web_metrics_put(ret, &s, &map);
 }
 
 /* What is kept from here on gives the map that begins here. */
@@ -663,6 +711,8 @@ static void close_all(struct daemon *d)
 		unwatch(d, i);
 	if (d->server)
 		server_stop(d->server);
+	web_stop(d->web);
+	snapshots_stop(d->snapshots);
 	worker_destroy(d->worker); /* before the handle that its thread speaks to */
 	d->worker = NULL;
 	for (size_t i = 0; i < sizeof(handles) / sizeof(handles[0]); i++)
@@ -719,7 +769,26 @@ static bool begin_parts(struct daemon *d)
 	d->pipeline = pipeline_create(config, &sink);
 	d->supervisor = supervisor_create(config, d->driver, &host);
 	d->archive = archive_create(&d->loop, config->map.archive, config->map.cell_m, on_saved, d);
-	return d->publisher && d->worker && d->pipeline && d->supervisor && d->archive;
+	d->snapshots = snapshots_create(&d->loop, d->publisher, config->map.archive, on_snapshot_saved, d);
+	return d->publisher && d->worker && d->pipeline && d->supervisor && d->archive && d->snapshots;
+}
+
+/* A web that the configuration names must be possible. The default one need not: a second daemon on this machine, or a build
+ * without it, maps all the same. */
+static int begin_web(struct daemon *d, const struct server_host *server)
+{
+	const struct web_host host = {*server, put_metrics, d->snapshots, false};
+	int r;
+
+	d->web = web_create(&d->loop, d->config, d->publisher, &host, &r, d->error);
+	if (!d->web && r < 0 && !d->config->listen.http_set) {
+		log_line(LOG_WARNING, "%s; the map goes on without it", d->error);
+		return 0;
+	}
+	if (!d->web)
+		return r;
+	web_speak(d->web, &web_native_language, NULL);
+	return web_start(d->web, d->error);
 }
 
 static int begin(struct daemon *d, const struct daemon_options *options)
@@ -738,7 +807,9 @@ static int begin(struct daemon *d, const struct daemon_options *options)
 	}
 	begin_list(d);
 	d->server = server_create(&d->loop, d->config, d->publisher, &host, d->error);
-	return d->server ? 0 : -EADDRINUSE;
+	if (!d->server)
+		return -EADDRINUSE;
+	return begin_web(d, &host);
 }
 
 static void finish(struct daemon *d)
@@ -746,7 +817,6 @@ static void finish(struct daemon *d)
 	supervisor_destroy(d->supervisor);
 	server_destroy(d->server);
 	pipeline_destroy(d->pipeline);
-	publisher_destroy(d->publisher);
 	archive_stop(d->archive);
 	journal_destroy(d->journal);
 }
@@ -757,6 +827,8 @@ static void announce(struct daemon *d)
 
 	for (int i = 0; (address = server_address(d->server, i)) != NULL; i++)
 		log_line(LOG_INFO, "listens on %s", address);
+	if (web_address(d->web))
+		log_line(LOG_INFO, "listens on %s", web_address(d->web));
 	notify_ready();
 }
 
@@ -790,6 +862,10 @@ int daemon_run(const struct config *config, const struct daemon_options *options
 	/* Devices are closed with their supervisor, whose descriptors are then no longer polled. */
 	finish(d);
 	uv_run(&d->loop, UV_RUN_DEFAULT);
+	/* Snapshots that were being made hold pins until here. */
+	web_destroy(d->web);
+	snapshots_destroy(d->snapshots);
+	publisher_destroy(d->publisher);
 	uv_loop_close(&d->loop);
 	archive_destroy(d->archive);
 	free(d);

@@ -17,6 +17,7 @@
 #include <systemd/sd-daemon.h>
 #include <unistd.h>
 
+#include "config/config.h"
 #include "drivers/unix_socket.h"
 
 #define BACKLOG      64
@@ -32,22 +33,32 @@ static const char *explain_bind(int r)
 {
 	switch (r) {
 	case -EADDRINUSE:
-		return "somebody listens there already; stop that program or set another listen.native";
+		return "somebody listens there already; stop that program or set another";
 	case -ENOTSOCK:
-		return "a file that is no socket stands there; remove it or set another listen.native";
+		return "a file that is no socket stands there; remove it or set another";
 	case -ENOENT:
 	case -ENOTDIR:
-		return "the socket's directory does not exist; create it or set another listen.native";
+		return "the socket's directory does not exist; create it or set another";
 	case -EACCES:
 	case -EPERM:
 	case -EROFS:
-		return "may not be bound (no permission); let this user write the directory, or set another "
-		       "listen.native";
+		return "may not be bound (no permission); let this user write the directory, or set another";
 	case -EADDRNOTAVAIL:
-		return "this machine has no such address; set another listen.native";
+		return "this machine has no such address; set another";
 	default:
-		return strerror(-r);
+		return NULL;
 	}
+}
+
+static int refuse_bind(const struct listener *l, int r, char error[320])
+{
+	const char *why = explain_bind(r);
+
+	if (why)
+		snprintf(error, 320, "%.120s: %s %s", l->name, why, l->key);
+	else
+		snprintf(error, 320, "%.120s: %s", l->name, strerror(-r));
+	return r;
 }
 
 static void give_to_group(const char *path, const char *name)
@@ -103,7 +114,7 @@ static int open_unix(struct listener *l, const char *group, char error[320])
 		return refuse(l, -errno, strerror(errno), error);
 	r = unix_socket_bind(l->fd, &address);
 	if (r < 0)
-		return refuse(l, r, explain_bind(r), error);
+		return refuse_bind(l, r, error);
 	give_to_group(l->address.path, group);
 	if (lstat(l->address.path, &st) == 0) {
 		l->dev = st.st_dev;
@@ -134,40 +145,69 @@ static int open_tcp(struct listener *l, char error[320])
 	int on = 1;
 
 	if (address_sockaddr(&l->address, &address, &len) < 0)
-		return refuse(l, -EINVAL, NOT_LOOPBACK, error);
+		return refuse(l, -EINVAL, "is no address; names are not looked up, write a number like 127.0.0.1",
+		              error);
 	l->fd = socket(address.ss_family, SOCK_STREAM | SOCK_NONBLOCK | SOCK_CLOEXEC, 0);
 	if (l->fd < 0)
 		return refuse(l, -errno, strerror(errno), error);
 	setsockopt(l->fd, SOL_SOCKET, SO_REUSEADDR, &on, sizeof(on));
 	if (bind(l->fd, (struct sockaddr *)&address, len) < 0)
-		return refuse(l, -errno, explain_bind(-errno), error);
+		return refuse_bind(l, -errno, error);
 	name_port(l);
 	return 0;
 }
 
-int listener_open(struct listener *l, const char *text, const char *group, char error[320])
+/* `text` is tcp:HOST:PORT or unix:PATH. */
+static int open_at(struct listener *l, const char *text, unsigned kinds, const char *key, char error[320])
 {
 	char sentence[ADDRESS_ERROR_MAX];
-	int r;
 
 	memset(l, 0, sizeof(*l));
 	l->fd = -1;
-	snprintf(l->name, sizeof(l->name), "%s", text);
-	if (address_parse(text, ADDRESS_UNIX | ADDRESS_TCP, &l->address, sentence) < 0) {
-		snprintf(error, 320, "listen.native: %s", sentence);
+	l->key = key;
+	snprintf(l->name, sizeof(l->name), "%.*s", (int)sizeof(l->name) - 1, text);
+	if (address_parse(text, kinds, &l->address, sentence) < 0) {
+		snprintf(error, 320, "%s: %s", key, sentence);
 		return -EINVAL;
 	}
 	l->local = l->address.kind == ADDRESS_UNIX;
-	if (address_check_loopback(&l->address, sentence) < 0)
-		return refuse(l, -EINVAL, NOT_LOOPBACK, error);
+	l->loopback = address_check_loopback(&l->address, sentence) == 0;
+	return 0;
+}
+
+static int begin_listening(struct listener *l, const char *group, char error[320])
+{
+	int r;
+
 	if (take_passed(l))
 		return 0;
 	r = l->local ? open_unix(l, group, error) : open_tcp(l, error);
 	if (r == 0 && listen(l->fd, BACKLOG) < 0)
-		r = refuse(l, -errno, explain_bind(-errno), error);
+		r = refuse_bind(l, -errno, error);
 	if (r < 0)
 		listener_close(l);
 	return r;
+}
+
+int listener_open(struct listener *l, const char *text, const char *group, char error[320])
+{
+	const int r = open_at(l, text, ADDRESS_UNIX | ADDRESS_TCP, "listen.native", error);
+
+	if (r < 0)
+		return r;
+	if (!l->loopback)
+		return refuse(l, -EINVAL, NOT_LOOPBACK, error);
+	return begin_listening(l, group, error);
+}
+
+int listener_open_http(struct listener *l, const char *text, char error[320])
+{
+	char with_word[CONFIG_TEXT_MAX + 4];
+	int r;
+
+	snprintf(with_word, sizeof(with_word), "tcp:%s", text);
+	r = open_at(l, with_word, ADDRESS_TCP, "listen.http", error);
+	return r < 0 ? r : begin_listening(l, "", error);
 }
 
 void listener_close(struct listener *l)

@@ -11,7 +11,7 @@
 #define SNAPSHOT_FACES_MAX 4000000u /* of the map; a larger one is for `facet save`, which has its own memory */
 #define SNAPSHOT_NAME_MAX  128      /* bytes of a file's name, with the 0 */
 #define SNAPSHOT_ETAG_MAX  128
-#define SNAPSHOT_ERROR_MAX 400
+#define SNAPSHOT_ERROR_MAX 640
 
 enum snapshot_format { SNAPSHOT_PLY, SNAPSHOT_GLB, SNAPSHOT_OBJ, SNAPSHOT_STL, SNAPSHOT_FORMATS };
 const char *snapshot_ending(enum snapshot_format); /* "ply", ... */

@@ -17,7 +17,7 @@ mkdir "$out/held"
 # shellcheck disable=SC2016
 timeout -k 5 240 "$build/facet" simulate "profiles:$out/part.csv" --dir "$out/d" -- sh -eu -c '
     port=$(python3 -c "import socket; s = socket.socket(); s.bind((\"127.0.0.1\", 0)); print(s.getsockname()[1])")
-    sed -e "s/baud: 500000/baud: 38400/" -e "s|^listen: {native: \[\(.*\)\]}|listen: {native: [\1, \"tcp:127.0.0.1:$port\"], send_buffer: 16384}|" \
+    sed -e "s/baud: 500000/baud: 38400/" -e "s|^listen: {native: \[\([^]]*\)\]|listen: {native: [\1, \"tcp:127.0.0.1:$port\"], send_buffer: 16384|" \
         "$out/d/facetd.yaml" >"$out/config.yaml"
     "$build/facetd" --config "$out/config.yaml" --journal "$out/journal" 2>"$out/log" &
     daemon=$!

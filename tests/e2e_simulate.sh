@@ -45,7 +45,7 @@ refused 2 'only lms1xx and lms5xx' hall --laser tim --encoder
 refused 2 '--laser is for worlds' uos:/nowhere --laser tim
 refused 2 '--endless is for worlds' uos:/nowhere --endless
 refused 2 'only the TiM has a USB port' hall --laser lms1xx --usb
-refused 2 '--http: not yet' hall --http 127.0.0.1:1
+refused 2 '--http: .*not on loopback' hall --http 0.0.0.0:80
 refused 2 'world moves continuously' hall --speed 2
 refused 2 'world moves continuously' building --speed max
 refused 2 'neither max nor a number' hall --speed fast

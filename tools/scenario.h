@@ -96,7 +96,8 @@ struct scenario_params {
 	bool endless;           /* the drive goes there and back again until it is ended */
 	char *const *fault;     /* sentences (fault.h) */
 	int faults;
-	const char *tcp; /* HOST:PORT where the daemon is to listen too, or NULL */
+	const char *tcp;  /* HOST:PORT where the daemon is to listen too, or NULL */
+	const char *http; /* HOST:PORT of its page, or NULL */
 	uint64_t seed;
 	void *ctx;
 	void (*ended)(void *ctx, const char *said); /* called once */

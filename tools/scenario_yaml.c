@@ -209,6 +209,6 @@ int scenario_yaml(const struct scenario_params *params, bool sweeps, int servo_p
 	add(&text, "listen: {native: [\"unix:%s/facetd.sock\"", params->dir);
 	if (params->tcp)
 		add(&text, ", \"tcp:%s\"", params->tcp);
-	add(&text, "]}\n");
+	add(&text, "], http: \"%s\"}\n", params->http ? params->http : "");
 	return text.len == text.cap ? -ENOSPC : (int)text.len;
 }

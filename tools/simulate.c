@@ -31,7 +31,7 @@
 #define SEED     1
 
 struct options {
-	const char *scenario, *dir, *tcp;
+	const char *scenario, *dir, *tcp, *http;
 	char *more[64];
 	int more_n;
 	char *fault[64];
@@ -112,7 +112,7 @@ static const struct argp_option option_list[] = {
      "may "
      "be repeated; a DEVICE or KIND that is wrong is answered with those there are",
      0},
-    {"http", OPTION_HTTP, "HOST:PORT", 0, "not yet: the browser page will come later", 0},
+    {"http", OPTION_HTTP, "HOST:PORT", 0, "let the daemon serve its page, snapshots and WebSockets here", 0},
     {0},
 };
 
@@ -136,14 +136,14 @@ static void parse_seed(struct argp_state *state, const char *arg, struct options
 		argp_error(state, "--seed: '%s' is not a whole number", arg);
 }
 
-static void parse_tcp(struct argp_state *state, const char *arg, struct options *o)
+static const char *parse_loopback(struct argp_state *state, const char *option, const char *arg)
 {
 	char why[ADDRESS_ERROR_MAX];
 	struct address address;
 
 	if (address_parse_host(arg, &address, why) < 0 || address_check_loopback(&address, why) < 0)
-		argp_error(state, "--tcp: %s", why);
-	o->tcp = arg;
+		argp_error(state, "%s: %s", option, why);
+	return arg;
 }
 
 static void parse_laser(struct argp_state *state, const char *arg, struct options *o)
@@ -225,7 +225,7 @@ static error_t parse_option(int key, char *arg, struct argp_state *state)
 		o->dir = arg;
 		return 0;
 	case OPTION_TCP:
-		parse_tcp(state, arg, o);
+		o->tcp = parse_loopback(state, "--tcp", arg);
 		return 0;
 	case OPTION_SERVO:
 		parse_servo(state, arg, o);
@@ -255,7 +255,7 @@ static error_t parse_option(int key, char *arg, struct argp_state *state)
 		o->endless = true;
 		return 0;
 	case OPTION_HTTP:
-		argp_error(state, "--http: not yet; the browser page will come later");
+		o->http = parse_loopback(state, "--http", arg);
 		return 0;
 	case ARGP_KEY_ARG:
 		take_argument(state, arg, o);
@@ -566,6 +566,8 @@ static void say_where(const struct simulation *s, const struct options *o)
 	printf("address unix:%s/facetd.sock\n", s->dir);
 	if (o->tcp)
 		printf("address tcp:%s\n", o->tcp);
+	if (o->http)
+		printf("page http://%s/\n", o->http);
 	printf("faults are ordered at %s/simulator.sock\n", s->dir);
 }
 
@@ -596,6 +598,7 @@ static int simulate(struct simulation *s, struct options *o)
 	                                 .fault = o->fault,
 	                                 .faults = o->faults,
 	                                 .tcp = o->tcp,
+	                                 .http = o->http,
 	                                 .seed = o->seed,
 	                                 .ctx = s,
 	                                 .ended = on_ended};

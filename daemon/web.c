@@ -1,0 +1,978 @@
+/* Connections of the web.
+ *
+ *   listener ─► connection: arrived ─ request ─┬─ plain ────► web_http's answer, in pieces ─► idle ─► next request
+ *                                              └─ upgrade ──► a language: pieces as there is room
+ *
+ * libwebsockets frames, encrypts and times out, on our own loop; sockets are accepted here and handed to it, so that limits
+ * are kept before it spends anything on a stranger. It takes a piece whole and holds what the kernel does not take, so at
+ * most one piece (WEB_PIECE_MAX) is ever held for a client that does not read: the next is asked of its language when
+ * that has gone out. Nothing queues.
+ *
+ * At the limit of connections the one that has waited longest for a request goes: who opens sockets and says nothing
+ * shuts nobody out. What libwebsockets would log is not: strangers could fill the log with it.
+ *
+ * Traps of libwebsockets 4.1: the loop needs its plugin for libuv at run time; it speaks h2c and CONNECT unless they are
+ * refused; a context on a foreign loop is destroyed twice, before and after the loop ran dry. */
+#include "daemon/web.h"
+
+#ifdef HAVE_WEB
+
+#include <assert.h>
+#include <errno.h>
+#include <fcntl.h>
+#include <libwebsockets.h>
+#include <netdb.h>
+#include <netinet/in.h>
+#include <netinet/tcp.h>
+#include <stdio.h>
+#include <stdlib.h>
+#include <string.h>
+#include <sys/socket.h>
+#include <syslog.h>
+#include <time.h>
+#include <unistd.h>
+
+#include "daemon/listener.h"
+#include "daemon/web_http.h"
+
+#define PLAIN_MAX       32 /* connections beyond listen.clients that may be open: requests, and clients that are told to go */
+#define DOORSTEP_MAX    8  /* ... of the latter */
+#define ACCEPTS_MAX     16 /* in one turn */
+#define HEADER_S        10 /* for a request to come, and for an answer to go on */
+#define KEPT_S          15 /* an idle connection is kept open for another request */
+#define SNAPSHOT_S      60 /* for a snapshot to be made */
+#define HEADERS_MAX     4096
+#define SETTLE_NS       10000000ll /* after the handshake; see web_language.open */
+#define TICK_MS         1000       /* doors that were closed for want of descriptors */
+#define PROTOCOLS_MAX   16
+#define RX_BYTES        4096
+#define CERTIFICATE_MAX (256u << 10)
+#define EXPIRES_SOON_S  (14 * 86400)
+
+enum stage { STAGE_ARRIVED, STAGE_IDLE, STAGE_ANSWERED, STAGE_SPEAKS };
+
+struct web_connection {
+	struct web *web;
+	struct web_connection *next;
+	struct lws *wsi; /* NULL until it is libwebsockets' */
+	bool owned;      /* ... which ends it */
+	uint64_t id;
+	struct sockaddr_storage from;
+	char address[64];
+	enum stage stage;
+	int64_t since_ns; /* in this stage */
+	struct web_rights rights;
+	uint64_t sent;
+	/* A plain request. */
+	struct web_answer answer;
+	bool answering, told; /* told: its header is out */
+	size_t answer_at;
+	/* A language. */
+	const struct web_language *language;
+	void *state;
+	bool begun, begun_text; /* a message */
+	bool asked;             /* to be called when there is room */
+	int64_t settle_ns;
+	struct buffer in; /* a message that is coming */
+	bool in_text;
+	int close_code;
+	char reason[WEB_REASON_MAX + 1];
+};
+
+struct speaker {
+	const struct web_language *language;
+	void *ctx;
+};
+
+struct web {
+	uv_loop_t *loop;
+	struct publisher *publisher;
+	struct web_host host;
+	struct web_site site;
+	struct listener listener;
+	char address[ADDRESS_TEXT_MAX + 16];
+	struct lws_context *context;
+	struct lws_vhost *vhost;
+	struct lws_protocols protocol[PROTOCOLS_MAX + 1];
+	struct speaker speaker[WEB_LANGUAGES_MAX];
+	int speakers;
+	int speaks[PROTOCOLS_MAX]; /* which of them, by protocol */
+	uv_poll_t door;
+	uv_timer_t timer, tick;
+	bool open, polling, stopped;
+	struct web_connection *connections;
+	size_t count, clients; /* all; of those that speak */
+	uint64_t next_id;
+	struct web_connection *arriving; /* while it is handed over */
+	uint8_t out[LWS_PRE + WEB_PIECE_MAX];
+};
+
+static int64_t now(const struct web *web)
+{
+	return web->host.server.now(web->host.server.ctx);
+}
+
+static void log_text(const struct web *web, int priority, const char *text)
+{
+	web->host.server.log(web->host.server.ctx, priority, text);
+}
+
+static void enter(struct web_connection *c, enum stage stage)
+{
+	c->stage = stage;
+	c->since_ns = now(c->web);
+}
+
+/* Ends */
+
+static void leave_language(struct web_connection *c)
+{
+	if (!c->language)
+		return;
+	if (c->state)
+		c->language->close(c->state);
+	c->language = NULL;
+	c->state = NULL;
+	c->web->clients--;
+}
+
+static void free_connection(struct web_connection *c)
+{
+	struct web_connection **at = &c->web->connections;
+
+	leave_language(c);
+	web_answer_finish(&c->answer);
+	buffer_finish(&c->in);
+	while (*at != c)
+		at = &(*at)->next;
+	*at = c->next;
+	c->web->count--;
+	free(c);
+}
+
+/* Plain answers */
+
+static bool put_header(struct lws *wsi, const char *name, const char *value, uint8_t **p, uint8_t *end)
+{
+	return lws_add_http_header_by_name(wsi, (const unsigned char *)name, (const unsigned char *)value,
+	                                   (int)strlen(value), p, end) == 0;
+}
+
+static bool put_optional_headers(struct lws *wsi, const struct web_answer *a, uint8_t **p, uint8_t *end)
+{
+	char text[80];
+	bool good = true;
+
+	if (a->type)
+		good &= put_header(wsi, "content-type:", a->type, p, end);
+	if (a->policy)
+		good &= put_header(wsi, "content-security-policy:", a->policy, p, end);
+	if (a->etag[0])
+		good &= put_header(wsi, "etag:", a->etag, p, end);
+	if (a->gzip)
+		good &= put_header(wsi, "content-encoding:", "gzip", p, end);
+	if (a->allow_origin)
+		good &= put_header(wsi, "access-control-allow-origin:", a->allow_origin, p, end);
+	if (a->allow_methods)
+		good &= put_header(wsi, "allow:", "GET, HEAD", p, end);
+	if (a->ask_token)
+		good &= put_header(wsi, "www-authenticate:", "Bearer", p, end);
+	if (a->file[0]) {
+		snprintf(text, sizeof(text), "attachment; filename=\"%s\"", a->file);
+		good &= put_header(wsi, "content-disposition:", text, p, end);
+	}
+	if (a->retry_after_s > 0) {
+		snprintf(text, sizeof(text), "%d", a->retry_after_s);
+		good &= put_header(wsi, "retry-after:", text, p, end);
+	}
+	return good;
+}
+
+/* False: it cannot be said. */
+static bool write_header(struct lws *wsi, const struct web_answer *a)
+{
+	uint8_t bytes[LWS_PRE + 2048], *start = bytes + LWS_PRE, *p = start, *end = bytes + sizeof(bytes);
+	bool good = lws_add_http_header_status(wsi, (unsigned)a->code, &p, end) == 0;
+
+	good &= put_header(wsi, "x-content-type-options:", "nosniff", &p, end);
+	good &= put_header(wsi, "referrer-policy:", "no-referrer", &p, end); /* an address may carry the token */
+	good &= put_header(wsi, "cache-control:", "no-cache", &p, end);      /* always ask; the etag saves the rest */
+	good &= put_header(wsi, "vary:", "Origin", &p, end);
+	good &= put_optional_headers(wsi, a, &p, end);
+	if (!(a->head && !a->bytes) && a->code != 304)
+		good &= lws_add_http_header_content_length(wsi, a->len, &p, end) == 0;
+	return good && lws_finalize_write_http_header(wsi, start, &p, end) == 0;
+}
+
+/* The whole of a short answer, now: the connection is closed behind it. */
+static void refuse(struct lws *wsi, struct web_answer *a)
+{
+	uint8_t bytes[LWS_PRE + 512];
+	const size_t n = a->len < 512 ? a->len : 512;
+
+	if (!write_header(wsi, a))
+		return;
+	memcpy(bytes + LWS_PRE, a->bytes, n);
+	lws_write(wsi, bytes + LWS_PRE, n, LWS_WRITE_HTTP_FINAL);
+}
+
+static int end_answer(struct web_connection *c)
+{
+	web_answer_finish(&c->answer);
+	c->answering = false;
+	enter(c, STAGE_IDLE);
+	return lws_http_transaction_completed(c->wsi) ? -1 : 0;
+}
+
+/* Goes on with an answer, as there is room. -1: the connection is to be closed. */
+static int write_answer(struct web_connection *c)
+{
+	struct web_answer *a = &c->answer;
+	size_t total = 0;
+
+	if (!c->answering || !web_answer_ready(a))
+		return 0;
+	if (!c->told && !write_header(c->wsi, a))
+		return -1;
+	c->told = true;
+	if (a->head || a->code == 304 || a->len == 0)
+		return end_answer(c);
+	lws_set_timeout(c->wsi, PENDING_TIMEOUT_HTTP_CONTENT, HEADER_S);
+	while (c->answer_at < a->len && total < WEB_TURN_BYTES && !lws_send_pipe_choked(c->wsi)) {
+		const size_t left = a->len - c->answer_at, n = left < WEB_PIECE_MAX ? left : WEB_PIECE_MAX;
+
+		memcpy(c->web->out + LWS_PRE, (const uint8_t *)a->bytes + c->answer_at, n);
+		if (lws_write(c->wsi, c->web->out + LWS_PRE, n, n == left ? LWS_WRITE_HTTP_FINAL : LWS_WRITE_HTTP) <
+		    (int)n)
+			return -1;
+		c->answer_at += n;
+		c->sent += n;
+		total += n;
+	}
+	if (c->answer_at == a->len)
+		return end_answer(c);
+	lws_callback_on_writable(c->wsi);
+	return 0;
+}
+
+/* Requests */
+
+/* The texts of a request, copied: libwebsockets' own go with the next one. */
+struct texts {
+	char host[300], origin[300], authorization[WEB_TOKEN_MAX + 16], token[WEB_TOKEN_MAX + 8], if_none_match[512];
+};
+
+/* NULL where it was not sent. One that is too long is not what we know, and is taken for an empty one. */
+static const char *take_header(struct lws *wsi, enum lws_token_indexes which, char *text, size_t cap)
+{
+	text[0] = '\0';
+	if (lws_hdr_total_length(wsi, which) == 0)
+		return NULL;
+	if (lws_hdr_copy(wsi, text, (int)cap, which) < 0)
+		text[0] = '\0';
+	return text;
+}
+
+static const char *take_token(struct lws *wsi, struct texts *texts)
+{
+	const char *value = lws_get_urlarg_by_name(wsi, "token=", texts->token, sizeof(texts->token));
+
+	return value && *value ? value : NULL;
+}
+
+static const char *method_of(struct lws *wsi)
+{
+	if (lws_hdr_total_length(wsi, WSI_TOKEN_GET_URI) > 0)
+		return "GET";
+	return lws_hdr_total_length(wsi, WSI_TOKEN_HEAD_URI) > 0 ? "HEAD" : "POST"; /* or another one that we refuse */
+}
+
+static void read_request(struct web_connection *c, const char *path, bool upgrade, struct texts *texts,
+                         struct web_request *ret)
+{
+	struct lws *wsi = c->wsi;
+
+	*ret = (struct web_request){.method = method_of(wsi), .path = path, .from = &c->from, .upgrade = upgrade};
+	ret->host = take_header(wsi, WSI_TOKEN_HOST, texts->host, sizeof(texts->host));
+	ret->origin = take_header(wsi, WSI_TOKEN_ORIGIN, texts->origin, sizeof(texts->origin));
+	ret->authorization =
+	    take_header(wsi, WSI_TOKEN_HTTP_AUTHORIZATION, texts->authorization, sizeof(texts->authorization));
+	ret->if_none_match =
+	    take_header(wsi, WSI_TOKEN_HTTP_IF_NONE_MATCH, texts->if_none_match, sizeof(texts->if_none_match));
+	ret->token = take_token(wsi, texts);
+}
+
+static bool admit(struct web_connection *c, const struct web_request *request)
+{
+	char line[160];
+	const bool admitted = web_site_admit(&c->web->site, request, &c->rights, &c->answer, line);
+
+	if (line[0])
+		log_text(c->web, LOG_WARNING, line);
+	return admitted;
+}
+
+static int on_request(struct web_connection *c, const char *path, size_t len)
+{
+	struct web_request request;
+	struct texts texts;
+	char name[256] = "/?"; /* a longer one is none of ours */
+
+	if (len < sizeof(name))
+		snprintf(name, sizeof(name), "%.*s", (int)len, path);
+	web_answer_finish(&c->answer);
+	enter(c, STAGE_ANSWERED);
+	c->answering = true;
+	c->told = false;
+	c->answer_at = 0;
+	read_request(c, name, false, &texts, &request);
+	if (admit(c, &request))
+		web_site_answer(&c->web->site, &request, &c->answer);
+	lws_set_timeout(c->wsi, PENDING_TIMEOUT_HTTP_CONTENT, c->answer.snapshot ? SNAPSHOT_S : HEADER_S);
+	if (web_answer_ready(&c->answer))
+		lws_callback_on_writable(c->wsi);
+	return 0;
+}
+
+/* 0: it may become a WebSocket; 1: refused, and told why; -1: just closed. */
+static int on_upgrade(struct web_connection *c, const char *to)
+{
+	struct web_request request;
+	struct texts texts;
+	bool admitted;
+
+	if (strcasecmp(to, "websocket") != 0)
+		return -1; /* HTTP/2 without TLS: nobody needs it */
+	read_request(c, "/", true, &texts, &request);
+	admitted = admit(c, &request);
+	if (!admitted)
+		refuse(c->wsi, &c->answer);
+	web_answer_finish(&c->answer);
+	return admitted ? 0 : 1;
+}
+
+/* Languages */
+
+static void set_timer(struct web *web);
+
+static void ask_for_room(struct web_connection *c)
+{
+	if (c->language && !c->asked && c->wsi) {
+		c->asked = true;
+		lws_callback_on_writable(c->wsi);
+	}
+}
+
+static int on_established(struct web_connection *c, const struct lws_protocols *protocol)
+{
+	struct web *web = c->web;
+	const struct speaker *speaker = &web->speaker[web->speaks[protocol->id]];
+
+	enter(c, STAGE_SPEAKS);
+	lws_set_timeout(c->wsi, NO_PENDING_TIMEOUT, 0);
+	c->language = speaker->language;
+	c->settle_ns = now(web) + SETTLE_NS;
+	if (++web->clients > (size_t)web->site.config->listen.clients + DOORSTEP_MAX)
+		return -1;
+	if (web->clients > (size_t)web->site.config->listen.clients) {
+		web_close(c, 1013, "as many clients as listen.clients allows are connected; try later or allow more");
+		return 0;
+	}
+	c->state = c->language->open(speaker->ctx, c, protocol->id == 0 ? speaker->language->names[0] : protocol->name);
+	if (!c->state)
+		web_close(c, 1011, "out of memory");
+	set_timer(web);
+	return 0;
+}
+
+static int close_now(struct web_connection *c)
+{
+	lws_close_reason(c->wsi, (enum lws_close_status)c->close_code, (unsigned char *)c->reason, strlen(c->reason));
+	return -1;
+}
+
+/* One piece. Its bytes, 0: nothing to say, -1: the connection is to be closed. */
+static int say_piece(struct web_connection *c, int64_t t_ns)
+{
+	struct web *web = c->web;
+	struct web_piece piece = {0};
+	int how;
+	size_t n;
+
+	if (c->close_code && !c->begun)
+		return close_now(c);
+	if (!c->state || t_ns < c->settle_ns)
+		return 0;
+	n = c->language->next(c->state, web->out + LWS_PRE, WEB_PIECE_MAX, t_ns, &piece);
+	assert(n <= WEB_PIECE_MAX);
+	if (n == 0)
+		return c->close_code && !c->begun ? close_now(c) : 0;
+	how = c->begun ? LWS_WRITE_CONTINUATION : piece.text ? LWS_WRITE_TEXT : LWS_WRITE_BINARY;
+	if (!piece.final)
+		how |= LWS_WRITE_NO_FIN;
+	c->begun = !piece.final;
+	c->sent += n;
+	return lws_write(c->wsi, web->out + LWS_PRE, n, (enum lws_write_protocol)how) < (int)n ? -1 : (int)n;
+}
+
+static int on_room(struct web_connection *c)
+{
+	const int64_t t_ns = now(c->web);
+	size_t total = 0;
+	int n = 1;
+
+	c->asked = false;
+	while (n > 0 && total < WEB_TURN_BYTES && !lws_send_pipe_choked(c->wsi)) {
+		n = say_piece(c, t_ns);
+		total += n > 0 ? (size_t)n : 0;
+	}
+	if (n < 0)
+		return -1;
+	if (n > 0)
+		ask_for_room(c);
+	set_timer(c->web);
+	return 0;
+}
+
+static int on_heard(struct web_connection *c, const void *data, size_t len)
+{
+	const bool first = lws_is_first_fragment(c->wsi),
+	           last = lws_is_final_fragment(c->wsi) && lws_remaining_packet_payload(c->wsi) == 0;
+
+	if (!c->state || c->close_code)
+		return 0;
+	if (first)
+		c->in_text = !lws_frame_is_binary(c->wsi);
+	if (len > WEB_HEARD_MAX - c->in.len) {
+		web_close(c, 1009, "a message of more than 64 KB");
+		buffer_finish(&c->in);
+		return 0;
+	}
+	if (first && last) {
+		if (c->language->hear)
+			c->language->hear(c->state, data, len, c->in_text);
+	} else {
+		buffer_append(&c->in, data, len);
+		if (c->in.error)
+			return -1;
+		if (last && c->language->hear)
+			c->language->hear(c->state, c->in.data, c->in.len, c->in_text);
+		if (last)
+			buffer_finish(&c->in);
+	}
+	set_timer(c->web);
+	return 0;
+}
+
+void web_close(struct web_connection *c, int code, const char *reason)
+{
+	if (c->close_code)
+		return;
+	c->close_code = code;
+	snprintf(c->reason, sizeof(c->reason), "%s", reason);
+	ask_for_room(c);
+}
+
+/* libwebsockets */
+
+static int on_lws(struct lws *wsi, enum lws_callback_reasons reason, void *user, void *in, size_t len)
+{
+	struct web *web = lws_context_user(lws_get_context(wsi));
+	struct web_connection *c = NULL;
+
+	(void)user;
+	switch (reason) {
+	case LWS_CALLBACK_WSI_CREATE:
+		if (web && web->arriving) /* not the pipe of its own */
+			web->arriving->owned = true;
+		return 0;
+	case LWS_CALLBACK_SERVER_NEW_CLIENT_INSTANTIATED:
+	case LWS_CALLBACK_WSI_DESTROY:
+	case LWS_CALLBACK_HTTP:
+	case LWS_CALLBACK_HTTP_CONFIRM_UPGRADE:
+	case LWS_CALLBACK_HTTP_WRITEABLE:
+	case LWS_CALLBACK_ESTABLISHED:
+	case LWS_CALLBACK_SERVER_WRITEABLE:
+	case LWS_CALLBACK_RECEIVE:
+	case LWS_CALLBACK_CLOSED:
+		c = lws_get_opaque_user_data(wsi);
+		break;
+	case LWS_CALLBACK_RAW_ADOPT: /* CONNECT is no way in */
+	case LWS_CALLBACK_RAW_RX:
+	case LWS_CALLBACK_RAW_WRITEABLE:
+		return -1;
+	default:
+		return 0;
+	}
+	if (!c)
+		return 0;
+	switch (reason) {
+	case LWS_CALLBACK_SERVER_NEW_CLIENT_INSTANTIATED:
+		c->wsi = wsi;
+		return 0;
+	case LWS_CALLBACK_WSI_DESTROY:
+		lws_set_opaque_user_data(wsi, NULL);
+		free_connection(c);
+		return 0;
+	case LWS_CALLBACK_HTTP:
+		return on_request(c, in, len);
+	case LWS_CALLBACK_HTTP_CONFIRM_UPGRADE:
+		return on_upgrade(c, in);
+	case LWS_CALLBACK_HTTP_WRITEABLE:
+		return write_answer(c);
+	case LWS_CALLBACK_ESTABLISHED:
+		return on_established(c, lws_get_protocol(wsi));
+	case LWS_CALLBACK_SERVER_WRITEABLE:
+		return on_room(c);
+	case LWS_CALLBACK_RECEIVE:
+		return on_heard(c, in, len);
+	default: /* CLOSED */
+		leave_language(c);
+		return 0;
+	}
+}
+
+/* Arrivals */
+
+static size_t limit(const struct web *web)
+{
+	return (size_t)web->site.config->listen.clients + PLAIN_MAX;
+}
+
+/* Makes room: the connection that has waited longest for a request. False: all of them are at work. */
+static bool evict(struct web *web)
+{
+	struct web_connection *oldest = NULL;
+
+	for (struct web_connection *c = web->connections; c; c = c->next)
+		if (c->wsi && c->stage <= STAGE_IDLE && (!oldest || c->since_ns <= oldest->since_ns))
+			oldest = c;
+	if (!oldest)
+		return false;
+	oldest->stage = STAGE_ANSWERED; /* not twice */
+	lws_set_timeout(oldest->wsi, PENDING_TIMEOUT_USER_OK, LWS_TO_KILL_ASYNC);
+	return true;
+}
+
+static void tune(const struct web *web, int fd)
+{
+	const int size = web->site.config->listen.send_buffer, on = 1, idle_s = 60;
+
+	if (size > 0)
+		setsockopt(fd, SOL_SOCKET, SO_SNDBUF, &size, sizeof(size));
+	setsockopt(fd, IPPROTO_TCP, TCP_NODELAY, &on, sizeof(on));
+	setsockopt(fd, SOL_SOCKET, SO_KEEPALIVE, &on, sizeof(on)); /* one that is gone without a word ends by this */
+	setsockopt(fd, IPPROTO_TCP, TCP_KEEPIDLE, &idle_s, sizeof(idle_s));
+}
+
+static void welcome(struct web *web, int fd, const struct sockaddr_storage *from)
+{
+	lws_adopt_desc_t adopt = {
+	    .vh = web->vhost, .type = LWS_ADOPT_SOCKET | LWS_ADOPT_HTTP | LWS_ADOPT_ALLOW_SSL, .fd.sockfd = fd};
+	struct web_connection *c = NULL;
+	char host[NI_MAXHOST] = "?", port[NI_MAXSERV] = "?";
+
+	if (web->count < limit(web) || (web->count < limit(web) + PLAIN_MAX && evict(web)))
+		c = calloc(1, sizeof(*c));
+	if (!c) {
+		close(fd);
+		return;
+	}
+	tune(web, fd);
+	getnameinfo((const struct sockaddr *)from, sizeof(*from), host, sizeof(host), port, sizeof(port),
+	            NI_NUMERICHOST | NI_NUMERICSERV);
+	*c = (struct web_connection){.web = web, .from = *from, .id = ++web->next_id, .next = web->connections};
+	snprintf(c->address, sizeof(c->address), "ws:%.48s:%.6s", host, port);
+	enter(c, STAGE_ARRIVED);
+	web->connections = c;
+	web->count++;
+	adopt.opaque = c;
+	web->arriving = c;
+	if (!lws_adopt_descriptor_vhost_via_info(&adopt) && !c->owned)
+		free_connection(c);
+	web->arriving = NULL;
+}
+
+static void on_door(uv_poll_t *door, int status, int events)
+{
+	struct web *web = door->data;
+
+	(void)status;
+	(void)events;
+	for (int i = 0; i < ACCEPTS_MAX; i++) {
+		struct sockaddr_storage from = {0};
+		socklen_t len = sizeof(from);
+		const int fd = accept4(web->listener.fd, (struct sockaddr *)&from, &len, SOCK_NONBLOCK | SOCK_CLOEXEC);
+
+		if (fd >= 0) {
+			welcome(web, fd, &from);
+			continue;
+		}
+		if (errno == EMFILE || errno == ENFILE || errno == ENOBUFS || errno == ENOMEM) {
+			/* Level-triggered polling would spin: the door opens again at the next tick. */
+			uv_poll_stop(door);
+			web->polling = false;
+		}
+		if (errno != ECONNABORTED && errno != EINTR)
+			return;
+	}
+}
+
+/* Time */
+
+static void on_tick(uv_timer_t *tick)
+{
+	struct web *web = tick->data;
+
+	if (web->polling)
+		return;
+	web->polling = true;
+	uv_poll_start(&web->door, UV_READABLE, on_door);
+}
+
+static int64_t deadline_of(const struct web_connection *c)
+{
+	const int64_t deadline_ns = c->language->deadline && c->state ? c->language->deadline(c->state) : INT64_MAX;
+
+	if (c->asked || !c->state)
+		return INT64_MAX;
+	return c->settle_ns > deadline_ns ? deadline_ns < INT64_MAX ? c->settle_ns : INT64_MAX : deadline_ns;
+}
+
+static void on_timer(uv_timer_t *timer)
+{
+	struct web *web = timer->data;
+	const int64_t t_ns = now(web);
+
+	for (struct web_connection *c = web->connections; c; c = c->next) {
+		if (c->language && c->settle_ns && t_ns >= c->settle_ns) {
+			c->settle_ns = 0;
+			ask_for_room(c);
+		} else if (c->language && deadline_of(c) <= t_ns) {
+			ask_for_room(c);
+		}
+	}
+	set_timer(web);
+}
+
+/* One timer for the nearest deadline of all languages. */
+static void set_timer(struct web *web)
+{
+	int64_t deadline_ns = INT64_MAX;
+	const int64_t t_ns = now(web);
+
+	if (web->stopped)
+		return;
+	for (const struct web_connection *c = web->connections; c; c = c->next) {
+		int64_t next_ns = INT64_MAX;
+
+		if (c->language)
+			next_ns = c->settle_ns ? c->settle_ns : deadline_of(c);
+		deadline_ns = next_ns < deadline_ns ? next_ns : deadline_ns;
+	}
+	if (deadline_ns == INT64_MAX)
+		uv_timer_stop(&web->timer);
+	else
+		uv_timer_start(&web->timer, on_timer,
+		               deadline_ns <= t_ns ? 1 : (uint64_t)((deadline_ns - t_ns + 999999) / 1000000), 0);
+}
+
+static void on_snapshot(void *ctx)
+{
+	struct web *web = ctx;
+
+	for (struct web_connection *c = web->connections; c; c = c->next)
+		if (c->answering && c->answer.snapshot)
+			lws_callback_on_writable(c->wsi);
+}
+
+/* The daemon's side */
+
+void web_wake(struct web *web)
+{
+	for (struct web_connection *c = web ? web->connections : NULL; c; c = c->next)
+		ask_for_room(c);
+}
+
+void web_event(struct web *web, const char *text, size_t len)
+{
+	for (struct web_connection *c = web ? web->connections : NULL; c; c = c->next)
+		if (c->state && c->language->event)
+			c->language->event(c->state, text, len);
+}
+
+size_t web_clients(const struct web *web, struct control_client *ret, size_t cap)
+{
+	size_t n = 0;
+
+	for (const struct web_connection *c = web ? web->connections : NULL; c; c = c->next) {
+		if (!c->state)
+			continue;
+		if (n < cap) {
+			memset(&ret[n], 0, sizeof(ret[n]));
+			ret[n].id = c->id;
+			ret[n].kind = c->language->kind;
+			snprintf(ret[n].address, sizeof(ret[n].address), "%s", c->address);
+			ret[n].sent = c->sent;
+			if (c->language->stats)
+				c->language->stats(c->state, &ret[n]);
+		}
+		n++;
+	}
+	return n;
+}
+
+const char *web_address(const struct web *web)
+{
+	return web ? web->address : NULL;
+}
+
+bool web_loopback(const struct web *web)
+{
+	return !web || web->site.loopback;
+}
+
+void web_wake_one(struct web_connection *c)
+{
+	ask_for_room(c);
+}
+
+const struct web_rights *web_rights(const struct web_connection *c)
+{
+	return &c->rights;
+}
+
+const struct server_host *web_server_host(const struct web_connection *c)
+{
+	return &c->web->host.server;
+}
+
+const struct buffer *web_status(const struct web_connection *c)
+{
+	return web_site_status(&c->web->site);
+}
+
+void web_forget_status(const struct web_connection *c)
+{
+	c->web->site.status.len = 0;
+}
+
+struct publisher *web_publisher(const struct web_connection *c)
+{
+	return c->web->publisher;
+}
+
+void web_hold(struct web_connection *c, bool on)
+{
+	lws_rx_flow_control(c->wsi, on ? 0 : 1);
+}
+
+/* Life */
+
+/* A certificate that cannot be used is told before anybody tries. Empty: it is good; else a sentence. `ret_soon`: days until it
+ * expires, if these are few, else -1. */
+static void judge_certificate(const struct config *config, int *ret_soon, char error[320])
+{
+	union lws_tls_cert_info_results info = {0};
+	struct lws_x509_cert *x509 = NULL;
+	const char *path = config->listen.certificate;
+	FILE *file = fopen(path, "re");
+	char *text = calloc(1, CERTIFICATE_MAX);
+	size_t n = file && text ? fread(text, 1, CERTIFICATE_MAX - 1, file) : 0;
+
+	*ret_soon = -1;
+	error[0] = '\0';
+	if (n == 0)
+		snprintf(error, 320, "listen.tls.certificate: %.120s cannot be read (%s)", path,
+		         file ? "it is empty" : strerror(errno));
+	else if (lws_x509_create(&x509) || lws_x509_parse_from_pem(x509, text, n + 1))
+		snprintf(error, 320, "listen.tls.certificate: %.120s is no certificate in PEM", path);
+	else if (lws_x509_info(x509, LWS_TLS_CERT_INFO_VALIDITY_TO, &info, 0) == 0 && info.time < time(NULL))
+		snprintf(error, 320, "listen.tls.certificate: %.120s has expired; renew it", path);
+	else if (info.time && info.time - time(NULL) < EXPIRES_SOON_S)
+		*ret_soon = (int)((info.time - time(NULL)) / 86400);
+	if (x509)
+		lws_x509_destroy(&x509);
+	if (file)
+		fclose(file);
+	free(text);
+}
+
+static bool check_tls(struct web *web, char error[320])
+{
+	const struct config *config = web->site.config;
+	char text[200];
+	int days;
+
+	if (!config->listen.has_tls)
+		return true;
+	if (access(config->listen.key, R_OK) < 0) {
+		snprintf(error, 320, "listen.tls.key: %.120s cannot be read (%s)", config->listen.key, strerror(errno));
+		return false;
+	}
+	judge_certificate(config, &days, error);
+	if (days >= 0) {
+		snprintf(text, sizeof(text), "listen.tls.certificate expires in %d days; renew it", days);
+		log_text(web, LOG_WARNING, text);
+	}
+	return error[0] == '\0';
+}
+
+struct web *web_create(uv_loop_t *loop, const struct config *config, struct publisher *publisher,
+                       const struct web_host *host, int *ret_why, char error[320])
+{
+	struct web *web = config->listen.http[0] ? calloc(1, sizeof(*web)) : NULL;
+	const char *scheme = config->listen.has_tls ? "https" : "http";
+	int r = 0;
+
+	error[0] = '\0';
+	*ret_why = config->listen.http[0] ? -ENOMEM : 0;
+	if (!config->listen.http[0])
+		return NULL;
+	snprintf(error, 320, "out of memory");
+	if (!web)
+		return NULL;
+	error[0] = '\0';
+	web->loop = loop;
+	web->publisher = publisher;
+	web->host = *host;
+	web->site.config = config;
+	web->site.host = &web->host;
+	web->listener.fd = -1;
+	if (config->listen.token_file[0])
+		r = web_token_read(config->listen.token_file, web->site.secret, error);
+	if (r == 0 && !check_tls(web, error))
+		r = -EINVAL;
+	if (r == 0)
+		r = listener_open_http(&web->listener, config->listen.http, error);
+	if (r < 0) {
+		*ret_why = r;
+		free(web);
+		return NULL;
+	}
+	web->site.loopback = web->listener.loopback;
+	snprintf(web->address, sizeof(web->address), "%s://%s/", scheme, web->listener.name + 4 /* tcp: */);
+	return web;
+}
+
+void web_speak(struct web *web, const struct web_language *language, void *ctx)
+{
+	if (!web)
+		return;
+	assert(web->speakers < WEB_LANGUAGES_MAX && !web->context);
+	web->speaker[web->speakers++] = (struct speaker){language, ctx};
+}
+
+/* Protocol 0 is plain HTTP, and what a client that names no subprotocol speaks: the first language. */
+static void list_protocols(struct web *web)
+{
+	int n = 0;
+
+	web->protocol[n++] = (struct lws_protocols){.name = "http", .callback = on_lws};
+	for (int i = 0; i < web->speakers; i++)
+		for (const char *const *name = web->speaker[i].language->names; *name && n < PROTOCOLS_MAX; name++) {
+			web->speaks[n] = i;
+			web->protocol[n++] = (struct lws_protocols){.name = *name, .callback = on_lws};
+		}
+	for (int i = 0; i < n; i++) {
+		web->protocol[i].id = (unsigned)i;
+		web->protocol[i].rx_buffer_size = RX_BYTES;
+		web->protocol[i].tx_packet_size = WEB_PIECE_MAX + 64; /* and its frame's head */
+	}
+}
+
+static bool create_context(struct web *web, char error[320])
+{
+	const struct config *config = web->site.config;
+	void *loops[] = {web->loop};
+	struct lws_context_creation_info info = {.port = CONTEXT_PORT_NO_LISTEN_SERVER,
+	                                         .protocols = web->protocol,
+	                                         .options = LWS_SERVER_OPTION_LIBUV | LWS_SERVER_OPTION_EXPLICIT_VHOSTS,
+	                                         .foreign_loops = loops,
+	                                         .user = web,
+	                                         .gid = (gid_t)-1,
+	                                         .uid = (uid_t)-1,
+	                                         .fd_limit_per_thread = (unsigned)(limit(web) + 2 * PLAIN_MAX),
+	                                         .timeout_secs = HEADER_S,
+	                                         .keepalive_timeout = KEPT_S,
+	                                         .max_http_header_data = HEADERS_MAX,
+	                                         .server_string = "facetd",
+	                                         .vhost_name = "facetd",
+	                                         .alpn = "http/1.1"};
+
+	lws_set_log_level(0, NULL);
+	if (config->listen.has_tls) {
+		info.options |= LWS_SERVER_OPTION_DO_SSL_GLOBAL_INIT;
+		info.ssl_cert_filepath = config->listen.certificate;
+		info.ssl_private_key_filepath = config->listen.key;
+		info.ssl_options_set = SSL_OP_NO_TLSv1 | SSL_OP_NO_TLSv1_1;
+	}
+	web->context = lws_create_context(&info);
+	if (!web->context) {
+		snprintf(error, 320,
+		         "libwebsockets cannot use the loop; install libwebsockets-evlib-uv, or leave listen.http "
+		         "empty");
+		return false;
+	}
+	web->vhost = lws_create_vhost(web->context, &info);
+	if (!web->vhost)
+		snprintf(error, 320,
+		         config->listen.has_tls ? "listen.tls: %.100s and %.100s do not belong together, or are no PEM"
+		                                : "libwebsockets does not start",
+		         config->listen.certificate, config->listen.key);
+	return web->vhost != NULL;
+}
+
+int web_start(struct web *web, char error[320])
+{
+	if (!web)
+		return 0;
+	list_protocols(web);
+	uv_timer_init(web->loop, &web->timer);
+	uv_timer_init(web->loop, &web->tick);
+	web->timer.data = web->tick.data = web->door.data = web;
+	if (uv_poll_init(web->loop, &web->door, web->listener.fd) < 0) {
+		uv_close((uv_handle_t *)&web->timer, NULL);
+		uv_close((uv_handle_t *)&web->tick, NULL);
+		snprintf(error, 320, "%.120s: cannot be polled", web->address);
+		return -EINVAL;
+	}
+	web->open = true;
+	if (!create_context(web, error))
+		return -EINVAL;
+	snapshots_watch(web->host.snapshots, on_snapshot, web);
+	uv_timer_start(&web->tick, on_tick, 0, TICK_MS);
+	return 0;
+}
+
+void web_stop(struct web *web)
+{
+	if (!web || web->stopped)
+		return;
+	web->stopped = true;
+	for (struct web_connection *c = web->connections; c; c = c->next)
+		leave_language(c);
+	if (web->open) {
+		uv_poll_stop(&web->door);
+		uv_close((uv_handle_t *)&web->door, NULL);
+		uv_close((uv_handle_t *)&web->timer, NULL);
+		uv_close((uv_handle_t *)&web->tick, NULL);
+	}
+	if (web->context)
+		lws_context_destroy(web->context); /* begins; the rest when the loop has run dry */
+}
+
+void web_destroy(struct web *web)
+{
+	if (!web)
+		return;
+	assert(web->stopped);
+	if (web->context)
+		lws_context_destroy(web->context);
+	assert(!web->connections);
+	listener_close(&web->listener);
+	buffer_finish(&web->site.status);
+	free(web);
+}
+
+#endif

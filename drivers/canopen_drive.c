@@ -17,7 +17,8 @@
  * A fault is reset once. It may be reset again when it was gone for ten minutes of running, or the drive was switched off
  * and on, or somebody else has reset it: a drive that trips at every sweep is reported, not driven on. Faults of the
  * communication (81xx) are of our own making (facetd was away), so these may be reset at once again, five times in a row
- * at most. Whoever was switched off by something else (an enable input, another master) is switched on again three times. */
+ * at most; likewise a drive that has no fault then but stops. Whoever was switched off by something else (an enable input,
+ * another master) is switched on again three times. */
 #include "drivers/canopen_drive.h"
 
 #include <limits.h>
@@ -120,7 +121,7 @@ void canopen_drive_begin(struct canopen_drive *d, int64_t t_ns)
 
 void canopen_drive_booted(struct canopen_drive *d)
 {
-	d->homed = d->spent = false;
+	d->homed = d->spent = d->silent = false;
 	d->unheard = d->losses = 0;
 	d->code = 0;
 }
@@ -158,10 +159,17 @@ void canopen_drive_position(struct canopen_drive *d, int32_t count)
 	d->position_known = true;
 }
 
+static bool is_communication(uint16_t code)
+{
+	return code >> 8 == 0x81;
+}
+
 void canopen_drive_emergency(struct canopen_drive *d, uint16_t code)
 {
-	if (code)
-		d->code = code;
+	if (!code)
+		return;
+	d->code = code;
+	d->silent |= is_communication(code);
 }
 
 /* Commands that it is asked to take */
@@ -429,6 +437,7 @@ static void enable(struct canopen_drive *d, int64_t t_ns)
 		d->demand = still(d);
 		d->control = CONTROL_ENABLE;
 		d->send = true;
+		d->silent = false;
 		enter(d, home ? CANOPEN_DRIVE_HOMING : CANOPEN_DRIVE_RUNNING, t_ns);
 		d->ran_since_ns = t_ns;
 		return;
@@ -455,11 +464,16 @@ static void enable(struct canopen_drive *d, int64_t t_ns)
 /* It is enabled no longer, and has no fault: the way up once more, a few times. */
 static void lose(struct canopen_drive *d, int64_t t_ns)
 {
-	if (++d->losses > LOSSES_MAX) {
-		stand(d, t_ns, STANDS_BY_STATE, "is disabled by something else again and again (it is in the state %s)",
+	if (d->silent ? d->unheard >= CANOPEN_DRIVE_UNHEARD : d->losses >= LOSSES_MAX) {
+		stand(d, t_ns, STANDS_BY_STATE, "%s again and again (it is in the state %s)",
+		      d->silent ? "misses facetd's heartbeat" : "is disabled by something else",
 		      canopen_wire_drive_text(d->state));
 		return;
 	}
+	if (d->silent)
+		d->unheard++;
+	else
+		d->losses++;
 	enter(d, CANOPEN_DRIVE_WAITING, t_ns);
 }
 
@@ -658,11 +672,6 @@ static void speed_answered(struct canopen_drive *d, bool good, uint32_t value)
 }
 
 /* Faults */
-
-static bool is_communication(uint16_t code)
-{
-	return code >> 8 == 0x81;
-}
 
 static void fault_stays(struct canopen_drive *d, const char *how, int64_t t_ns)
 {

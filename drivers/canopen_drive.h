@@ -18,7 +18,7 @@
 #define CANOPEN_DRIVE_ENABLE_NS  INT64_C(3000000000)   /* for the last one: brakes open, motors find their phases */
 #define CANOPEN_DRIVE_REPEAT_NS  INT64_C(100000000)    /* a command that shows no effect is sent again */
 #define CANOPEN_DRIVE_EARNED_NS  INT64_C(600000000000) /* who ran so long without a fault may be reset once more */
-#define CANOPEN_DRIVE_UNHEARD_NS INT64_C(2000000000)   /* ... after a fault of the communication (81xx) */
+#define CANOPEN_DRIVE_UNHEARD_NS INT64_C(2000000000)   /* ... after a fault, or a stop, of the communication (81xx) */
 #define CANOPEN_DRIVE_UNHEARD    5                     /* of those in a row, each before it ran so long: it stays */
 
 struct canopen_drive_setup {
@@ -105,6 +105,7 @@ struct canopen_drive {
 
 	/* What may still be forgiven. */
 	bool spent, was_fault, cured;
+	bool silent; /* an EMCY of the communication came since it was enabled */
 	int unheard, losses;
 	int64_t ran_since_ns, bit_since_ns;
 	bool bit_seen;

@@ -531,6 +531,52 @@ static void one_that_is_disabled_from_elsewhere_is_enabled_three_times(void **st
 	assert_non_null(strstr(d.why, "disabled by something else"));
 }
 
+/* 6007 made it stop, without a fault, and it stays operational. */
+static void one_that_missed_our_heartbeat_is_enabled_again_but_not_for_ever(void **state)
+{
+	struct plant p = plant(CANOPEN_SWITCH_ON_DISABLED);
+	struct canopen_drive d = drive(CANOPEN_POSITION);
+	int64_t t_ns = 0;
+
+	(void)state;
+	canopen_drive_begin(&d, t_ns);
+	for (int i = 0; i < 20; i++) { /* each after some running */
+		run(&d, &p, &t_ns, 3000);
+		assert_int_equal(d.phase, CANOPEN_DRIVE_RUNNING);
+		canopen_drive_emergency(&d, 0x8130);
+		canopen_drive_emergency(&d, 0);
+		p.state = CANOPEN_QUICK_STOP;
+	}
+	run(&d, &p, &t_ns, 3000);
+	for (int i = 0; i < CANOPEN_DRIVE_UNHEARD + 1; i++) { /* a heartbeat that never reaches it */
+		assert_int_equal(d.phase, CANOPEN_DRIVE_RUNNING);
+		canopen_drive_emergency(&d, 0x8130);
+		p.state = CANOPEN_QUICK_STOP;
+		run(&d, &p, &t_ns, 1000);
+	}
+	assert_int_equal(d.phase, CANOPEN_DRIVE_STANDING);
+	assert_non_null(strstr(d.why, "misses facetd's heartbeat"));
+}
+
+/* What it lost by our silence says nothing of what somebody else does to it. */
+static void an_emergency_long_past_excuses_no_one(void **state)
+{
+	struct plant p = plant(CANOPEN_SWITCH_ON_DISABLED);
+	struct canopen_drive d = drive(CANOPEN_POSITION);
+	int64_t t_ns = 0;
+
+	(void)state;
+	canopen_drive_begin(&d, t_ns);
+	run(&d, &p, &t_ns, 3000);
+	canopen_drive_emergency(&d, 0x8130);
+	for (int i = 0; i < 5; i++) { /* the first of them is the emergency's */
+		p.state = CANOPEN_SWITCH_ON_DISABLED;
+		run(&d, &p, &t_ns, 3000);
+		assert_int_equal(d.phase == CANOPEN_DRIVE_STANDING, i == 4);
+	}
+	assert_non_null(strstr(d.why, "disabled by something else"));
+}
+
 /* ---- commands ---- */
 
 static void a_target_goes_by_its_handshake(void **state)
@@ -897,6 +943,8 @@ int main(void)
 	    cmocka_unit_test(ten_minutes_without_a_fault_earn_another_reset),
 	    cmocka_unit_test(what_was_our_own_silence_is_reset_at_once_but_not_for_ever),
 	    cmocka_unit_test(one_that_is_disabled_from_elsewhere_is_enabled_three_times),
+	    cmocka_unit_test(one_that_missed_our_heartbeat_is_enabled_again_but_not_for_ever),
+	    cmocka_unit_test(an_emergency_long_past_excuses_no_one),
 	    cmocka_unit_test(a_target_goes_by_its_handshake),
 	    cmocka_unit_test(a_target_that_changes_at_once_is_taken_at_once),
 	    cmocka_unit_test(a_handshake_that_fails_has_its_sentence),

@@ -12,7 +12,7 @@
  *
  * Jumps. Where the wheels lead is known with odometry. Without it (or while it is silent) a robot goes on as it did or
  * stands, and it may have changed its speed by SLACK since the last pose: the longer nothing was heard, the less can be
- * called a jump. History is moved along with a jump, so that the twist goes on. The way back is recognised by the frame
+ * called a jump; what a silence hid holds for the poses after it until one of them has said where the robot is. History is moved along with a jump, so that the twist goes on. The way back is recognised by the frame
  * before: a single outlier is one jump and one back, and ignoring both leaves no trace. */
 #include "core/pose_track.h"
 
@@ -59,6 +59,13 @@ struct seen {
 	struct place place;
 };
 
+/* What silences of the wheels may have hidden; no absolute pose has told it yet. `ns` is 0 where there was none. */
+struct gap {
+	int64_t begin_ns, ns;
+	double m, rad;
+	double after_m; /* driven since */
+};
+
 struct pose_track {
 	struct pose_track_params params;
 	bool begun;        /* with odometry: `way` has a mark */
@@ -69,6 +76,7 @@ struct pose_track {
 	bool moved;              /* the wheels spoke: the three below hold */
 	int64_t moved_ns;        /* the end of the last motion */
 	double speed_m_s, rad_s; /* in it */
+	struct gap gap;
 	double z_m;
 	struct quat level;             /* roll and pitch of the last absolute pose */
 	bool absolute_seen, corrected; /* `corrected`: by one before that which is being taken */
@@ -234,12 +242,22 @@ static bool within(const struct pose_track *k, const struct judgement *j, const 
 	return m <= k->params.jump_m + j->slack_m && rad <= k->params.jump_rad + j->slack_rad;
 }
 
+static double change_m(double s)
+{
+	return SLACK_M_S2 / 2 * s * s;
+}
+
+static double change_rad(double s)
+{
+	return SLACK_RAD_S2 / 2 * s * s;
+}
+
 /* By the poses alone. */
 static struct judgement judge_by_poses(struct pose_track *k, const struct place *place, int64_t t_ns)
 {
 	const struct seen *last = seen_at(k, k->seen_end - 1);
 	const double s = (double)(t_ns - last->t_ns) * 1e-9;
-	struct judgement j = {.slack_m = SLACK_M_S2 / 2 * s * s, .slack_rad = SLACK_RAD_S2 / 2 * s * s};
+	struct judgement j = {.slack_m = change_m(s), .slack_rad = change_rad(s)};
 	int64_t base_ns;
 
 	j.expected = going_on(k, t_ns, &base_ns);
@@ -470,6 +488,7 @@ static void begin_at(struct pose_track *k, const struct mark *mark)
 	way_put(k, mark);
 	k->begun = true;
 	k->waiting = false;
+	k->gap = (struct gap){0};
 }
 
 /* The inverse of a symmetric, positive definite 3 x 3 matrix. */
@@ -584,7 +603,7 @@ static void correct(struct pose_track *k, uint64_t i, const struct mark *was, co
 static void go_ahead(struct pose_track *k, int64_t t_ns)
 {
 	const double s = (double)(t_ns - way_head(k)->t_ns) * 1e-9;
-	const double slack_m = SLACK_M_S2 / 2 * s * s, slack_rad = SLACK_RAD_S2 / 2 * s * s;
+	const double slack_m = change_m(s), slack_rad = change_rad(s);
 	struct mark to = moved(k, way_head(k), t_ns, k->speed_m_s * s, k->rad_s * s);
 
 	to.p[0] += slack_m * slack_m;
@@ -631,6 +650,15 @@ static void find_again(struct pose_track *k, const struct pose *pose, struct pos
 	hand_out_mark(k, &mark, mark.t_ns, jumped, ret);
 }
 
+/* In a silence the robot may have gone on, stopped or turned: so far, and after a turn the way since lies elsewhere. */
+static void allow_gap(const struct pose_track *k, int64_t t_ns, struct judgement *j)
+{
+	if (k->gap.ns == 0 || t_ns <= k->gap.begin_ns)
+		return;
+	j->slack_m += k->gap.m + fmin(k->gap.rad, 2) * k->gap.after_m;
+	j->slack_rad += k->gap.rad;
+}
+
 /* Where the absolute pose lies within the track, or just ahead of it. */
 static void adjust(struct pose_track *k, const struct pose *pose, struct pose_track_out *ret)
 {
@@ -642,6 +670,7 @@ static void adjust(struct pose_track *k, const struct pose *pose, struct pose_tr
 	struct mark was, is;
 	uint64_t i;
 
+	allow_gap(k, pose->t_ns, &j);
 	if (ahead)
 		go_ahead(k, pose->t_ns);
 	i = way_before(k, pose->t_ns);
@@ -659,6 +688,8 @@ static void adjust(struct pose_track *k, const struct pose *pose, struct pose_tr
 		correct(k, i, &was, &is);
 		k->count.adjusted++;
 	}
+	if (pose->t_ns >= k->gap.begin_ns + k->gap.ns)
+		k->gap = (struct gap){0};
 	if (jumped && !ahead) { /* the frame ends where the track does now */
 		struct mark head = *way_head(k);
 
@@ -717,13 +748,19 @@ static bool begin_with(struct pose_track *k, const struct motion *m)
 }
 
 /* Nothing was heard of the wheels: they may have gone on, or stood. */
-static void grow_over_gap(const struct pose_track *k, struct mark *mark, int64_t gap_ns)
+static void grow_over_gap(struct pose_track *k, struct mark *mark, int64_t gap_ns)
 {
 	const double s = (double)gap_ns * 1e-9, way = k->speed_m_s * s, turn = k->rad_s * s;
 
 	mark->p[0] = bounded(mark->p[0] + way * way, VARIANCE_MAX);
 	mark->p[3] = bounded(mark->p[3] + way * way, VARIANCE_MAX);
 	mark->p[5] = bounded(mark->p[5] + turn * turn, VARIANCE_MAX);
+	if (k->gap.ns == 0)
+		k->gap.begin_ns = mark->t_ns;
+	k->gap.ns = mark->t_ns + gap_ns - k->gap.begin_ns;
+	k->gap.m = bounded(k->gap.m + fabs(way) + change_m(s), FAR_M);
+	k->gap.rad = bounded(k->gap.rad + fabs(turn) + change_rad(s), FAR_M);
+	k->count.gaps++;
 }
 
 void pose_track_motion(struct pose_track *k, const struct motion *m, struct pose_track_out *ret)
@@ -748,12 +785,12 @@ void pose_track_motion(struct pose_track *k, const struct motion *m, struct pose
 		begin_at(k, &head);
 	}
 	gap = m->from_ns > head.t_ns;
-	if (gap) {
+	if (gap)
 		grow_over_gap(k, &head, m->from_ns - head.t_ns);
-		k->count.gaps++;
-	} else {
+	else
 		share = (double)(m->t_ns - head.t_ns) / (double)(m->t_ns - m->from_ns);
-	}
+	if (k->gap.ns > 0)
+		k->gap.after_m = bounded(k->gap.after_m + fabs(m->ahead_m * share), FAR_M);
 	s = (double)(m->t_ns - m->from_ns) * 1e-9;
 	k->speed_m_s = m->ahead_m / s;
 	k->rad_s = m->turn_rad / s;
@@ -859,11 +896,21 @@ static void seen_state(struct state *s, struct pose_track *k)
 	}
 }
 
+static void gap_state(struct state *s, struct gap *gap)
+{
+	state_time(s, &gap->begin_ns);
+	state_time(s, &gap->ns);
+	number_state(s, &gap->m, FAR_M);
+	number_state(s, &gap->rad, FAR_M);
+	number_state(s, &gap->after_m, FAR_M);
+	s->failed |= s->loading && (gap->ns < 0 || gap->m < 0 || gap->rad < 0 || gap->after_m < 0);
+}
+
 static void fields_state(struct state *s, struct pose_track *k)
 {
 	struct place level = {{0, 0, k->z_m}, k->level};
 
-	state_tag(s, "track1");
+	state_tag(s, "track2");
 	state_bool(s, &k->begun);
 	state_bool(s, &k->waiting);
 	state_time(s, &k->waited_ns);
@@ -872,6 +919,7 @@ static void fields_state(struct state *s, struct pose_track *k)
 	state_time(s, &k->moved_ns);
 	number_state(s, &k->speed_m_s, 1e12);
 	number_state(s, &k->rad_s, 1e12);
+	gap_state(s, &k->gap);
 	place_state(s, &level);
 	k->z_m = level.t.z;
 	k->level = level.q;

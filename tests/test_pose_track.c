@@ -384,6 +384,53 @@ static void the_track_begins_at_the_origin_where_nobody_says_more(void **state)
 	pose_track_destroy(track);
 }
 
+/* The wheels come back most of a second after the last pose: what the robot did meanwhile is told by the next one, which
+ * moved no map. A pose after that one is measured by the wheels alone again, and so is one of before the silence. */
+static void what_a_silence_hid_is_no_jump(void **state)
+{
+	static const double far_m[] = {0.9, 0.0}, turned[] = {0.0, 0.5};
+
+	(void)state;
+	for (int i = 0; i < 2; i++) {
+		struct pose_track *track = open_track(both);
+		struct pose_track_out out;
+
+		take(track, pose_at(T0, 0, 0, 0));
+		straight(track, 0, 100);
+		out = take(track, pose_at(T0 + 3000 * MS, 2, 0, 0)); /* the wheels are silent */
+		assert_false(out.has_jump);
+		drive(track, T0 + 3900 * MS, T0 + 3910 * MS, 0.01, 0);
+		drive(track, T0 + 3910 * MS, T0 + 3990 * MS, 0.09, 0);
+		out = take(track, pose_at(T0 + 3990 * MS, 2.1 + far_m[i], 0, turned[i]));
+		assert_false(out.has_jump);
+		assert_int_equal(status_of(track).jumps, 0);
+		drive(track, T0 + 3990 * MS, T0 + 4100 * MS, 0.0, 0);
+		out = take(track, pose_at(T0 + 4100 * MS, 2.1 + far_m[i] + 0.4, 0, turned[i]));
+		assert_true(out.has_jump);
+		pose_track_destroy(track);
+	}
+}
+
+static void a_jump_in_a_silence_is_still_one(void **state)
+{
+	struct pose_track *track = open_track(both);
+
+	(void)state;
+	take(track, pose_at(T0, 0, 0, 0));
+	straight(track, 0, 100);
+	drive(track, T0 + 1200 * MS, T0 + 1210 * MS, 0.01, 0);
+	assert_true(take(track, pose_at(T0 + 1210 * MS, 2.0, 0, 0)).has_jump);
+	pose_track_destroy(track);
+
+	track = open_track(both); /* late, and of before it */
+	take(track, pose_at(T0, 0, 0, 0));
+	straight(track, 0, 100);
+	drive(track, T0 + 1900 * MS, T0 + 1910 * MS, 0.01, 0);
+	assert_true(take(track, pose_at(T0 + 990 * MS, 1.5, 0, 0)).has_jump);
+	assert_false(take(track, pose_at(T0 + 1910 * MS, 2.3, 0, 0)).has_jump);
+	pose_track_destroy(track);
+}
+
 /* Poses a little ahead of the wheels go on as the wheels turned last; the motion that follows is not driven twice. */
 static void a_pose_ahead_of_the_wheels_costs_no_way(void **state)
 {
@@ -796,6 +843,8 @@ int main(void)
 	    cmocka_unit_test(the_track_begins_at_the_origin_where_nobody_says_more),
 	    cmocka_unit_test(a_pose_ahead_of_the_wheels_costs_no_way),
 	    cmocka_unit_test(a_silence_of_the_wheels_is_no_way),
+	    cmocka_unit_test(what_a_silence_hid_is_no_jump),
+	    cmocka_unit_test(a_jump_in_a_silence_is_still_one),
 	    cmocka_unit_test(poses_alone_are_followed_while_the_wheels_are_silent),
 	    cmocka_unit_test(motions_that_no_robot_makes_are_refused),
 	    cmocka_unit_test(a_jump_kept_is_marked_and_told_once),

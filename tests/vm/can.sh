@@ -41,7 +41,6 @@ play_for_ever() {
         sleep 0.1
     done &
     player=$!
-    trap 'stop_player; stop_daemon; judge' EXIT
 }
 stop_player() {
     [ -z "$player" ] || { kill "$player" 2>/dev/null; killall canplayer 2>/dev/null; wait "$player"; } 2>/dev/null
@@ -159,7 +158,6 @@ simulated_robot() {
     /usr/bin/chrt -f 10 "$FACET" simulate hall --servo canopen --endless --can can1:can0 --truth $scratch/truth --dir $scratch/robot "$@" \
         >$scratch/said 2>&1 &
     robot=$!
-    trap 'stop_daemon; stop_robot; cat $scratch/said; judge' EXIT
     until_true 60 grep -q 'faults are ordered' $scratch/said || fail "the robot does not start"
     # This machine is slow: a slow line, a scanner that looks at few places, SYNCs at half the pace, and turns so gentle that a
     # SYNC without an answer, as there are some where both ends have one processor, still bends no angle; coarse cells.
@@ -167,8 +165,10 @@ simulated_robot() {
     echo 'map: {cell: 0.2}' >>$scratch/facetd.yaml
 }
 stop_robot() {
-    kill "$robot" 2>/dev/null && wait "$robot"
+    ended $robot
+    robot=
 }
+robot=
 # turns_of TRUTH: how often the axis went the other way, by more than a degree.
 turns_of() {
     /usr/bin/awk '!/^#/ { at = $2 * 57.29578
@@ -199,7 +199,7 @@ can_swept() {
     echo "note: angles: $(figure $scratch/figures angles) at $(figure $scratch/figures rate_hz) Hz, p99 $(figure $scratch/figures error_p99_deg), max $(figure $scratch/figures error_max_deg) degree; $rows rows, $sweeps sweeps, $faces faces"
     # What is judged is where an angle is said to be, not how many this processor can carry: of 50 a second.
     below 48 "$(figure $scratch/figures rate_hz)" ||
-        { echo "this machine is too busy: $(figure $scratch/figures rate_hz) of 50 angles a second"; exit 77; }
+        skip "this machine is too busy: $(figure $scratch/figures rate_hz) of 50 angles a second"
     [ "${faces:-0}" -ge 500 ] || fail "the mesh has only $faces faces"
     turns=$(turns_of $scratch/truth)
     echo "note: the axis turned $turns times"
@@ -244,8 +244,7 @@ arrived() {
 can_by_hand() {
     simulated_robot
     candump -L can0 >$scratch/dump 2>/dev/null &
-    dump=$!
-    trap 'kill $dump; stop_robot; judge' EXIT
+    others=$!
     cansend can0 000#8105 # reset the node: it boots up
     until_true 10 grep -q ' 705#00' $scratch/dump || fail "no boot-up message"
     cansend can0 000#0105 # start it
@@ -272,43 +271,93 @@ can_by_hand() {
 moves() {
     tail -n 500 $scratch/truth | /usr/bin/awk '{ if (NR > 1 && $2 != last) n++; last = $2 } END { exit !(n > 100) }'
 }
-# stands MS: how many ms the axis stood still at the end of what the simulator wrote so far.
-stood_ms() {
-    tail -n 6000 $scratch/truth | /usr/bin/awk '{ if ($2 != last) { last = $2; n = 0 } else n++; if (n > most) most = n } END { print most + 0 }'
+# stands: since a second and a half.
+stands() {
+    tail -n 1500 $scratch/truth | /usr/bin/awk '{ if (NR > 1 && $2 != last) n++; last = $2 } END { exit NR < 1500 || n > 0 }'
+}
+# amid: 30 degrees and more from both ends of the sweep, -65 and 45, where it would stand for a moment anyway.
+amid() {
+    is_within -35 15
+}
+is_within() { # DEGREES DEGREES
+    tail -n 2 $scratch/truth | head -n 1 | /usr/bin/awk -v a="$1" -v b="$2" '{ at = $2 * 57.29578; exit !(a <= at && at <= b) }'
 }
 
-# Without the scanner, whose rays are too much for this machine beside.
+# This machine may itself be held up, by whoever shares its processor. How long it was at most is watched beside.
+watch_standstills() {
+    echo 0 >$scratch/standstill
+    while sleep 0.2 && read -r up rest </proc/uptime; do
+        now=${up%.*}${up#*.}0
+        over=$((now - ${before:-$now} - 200))
+        [ $over -le "$(cat $scratch/standstill)" ] || echo $over >$scratch/standstill
+        before=$now
+    done &
+    others=$!
+}
+# Lost although nothing was done to it, or not come: where the machine stood still for a heartbeat or longer that says nothing
+# of facetd.
+starved_or_fail() {
+    standstill=$(cat $scratch/standstill)
+    [ "${standstill:-0}" -lt 1000 ] || skip "this machine is too busy: it stood still for $standstill ms, and $*"
+    fail "$*"
+}
+# untouched: sweeps, amid its way, and was not lost since $lost was counted.
+untouched() {
+    until_true 60 amid || starved_or_fail "it does not sweep through the middle"
+    sleep 1.2 # the status is of the last second
+    losses=$(status_of servo losses)
+    [ "$losses" = "$lost" ] || starved_or_fail "the servo was lost by itself: $losses times, $lost before"
+}
+sweeps_again() { # WHEN: $again, the ms since $began
+    until_true 90 moves || starved_or_fail "it does not sweep $1: $(status_of servo note)"
+    again=$(($(uptime_ms) - began))
+    sleep 1.2
+    lost=$(status_of servo losses)
+}
+# The drive has to stop by itself: while it is within its sweep, and not because that is over.
+stops() { # WHY
+    until_true 30 stands || starved_or_fail "it moves on $1"
+    is_within -63 43 || fail "it stopped at the end of its sweep only, $1"
+}
+
+# Without the scanner, whose rays are too much for this machine beside. Heartbeats of a second, a slow SYNC and a gentle sweep:
+# three seconds in which nothing was heard are somebody's doing, and those after them still belong to the same way.
 can_heartbeats() {
     simulated_robot
-    sed -i '/name: laser/,/tilt: servo/d' $scratch/facetd.yaml
+    sed -i '/name: laser/,/tilt: servo/d; s/heartbeat: 200ms/heartbeat: 1s, timeout: 5s/; s/sync: 20ms/sync: 50ms/
+        s/speed: 37.5deg/speed: 4deg/' $scratch/facetd.yaml
+    watch_standstills
     start_daemon
-    trap 'stop_daemon; stop_robot; cat $scratch/said; judge' EXIT
-    until_true 90 is servo state streaming || fail "the servo does not stream: $(status_of servo error)"
-    until_true 30 moves || fail "it does not sweep"
+    until_true 90 is servo state streaming || starved_or_fail "the servo does not stream: $(status_of servo error)"
+    until_true 60 moves || starved_or_fail "it does not sweep"
+    lost=0
+    untouched
     kill -STOP $daemon
-    sleep 4
+    began=$(uptime_ms)
+    stops "while facetd is stopped"
+    stood=$(($(uptime_ms) - began))
     kill -CONT $daemon
     began=$(uptime_ms)
-    stood=$(stood_ms)
-    [ "$stood" -ge 1500 ] || fail "the drive stood for $stood ms only while facetd was stopped for 4 s"
-    until_true 60 moves || fail "it does not sweep again"
-    again=$(($(uptime_ms) - began))
+    sweeps_again "after facetd was stopped"
+    echo "note: stands $stood ms after facetd was stopped, sweeps $again ms after it goes on"
+    untouched
     $ip link set can0 down
     until_true 20 says 'servo: .*can0 was set down' || fail "the end of the interface is not said"
-    sleep 3
-    moves && fail "it moves without a master"
+    stops "without a master"
     $ip link set can0 up
     began=$(uptime_ms)
-    until_true 60 moves || fail "it does not sweep after the interface is back"
-    echo "note: stood for $stood of 4000 ms, sweeps $again ms later; $(($(uptime_ms) - began)) ms after the interface is up"
+    sweeps_again "after the interface is back"
+    echo "note: sweeps $again ms after the interface is up"
     # Pulled out, and plugged in.
+    untouched
     device=$(/usr/bin/readlink -f /sys/class/net/can0/device)
     echo 1 >"$device/remove"
     until_true 20 says 'there is no interface can0\|the interface can0 has gone' || fail "that it was pulled out is not said"
+    stops "with its wire pulled out"
     echo 1 >/sys/bus/pci/rescan
     until_true 20 test -e /sys/class/net/can0 || fail "the kernel does not find it again"
     controller_up can0 || fail "it cannot be set up again"
     began=$(uptime_ms)
-    until_true 60 moves || fail "it does not sweep after it was plugged in again"
-    echo "note: $(($(uptime_ms) - began)) ms after it was plugged in again"
+    sweeps_again "after it was plugged in again"
+    echo "note: sweeps $again ms after it was plugged in again; this machine stood still for $(cat $scratch/standstill) ms at most"
 }

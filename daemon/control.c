@@ -9,12 +9,11 @@
 #include <stdlib.h>
 #include <string.h>
 
-static const char *const words[] = {"STATUS", "WATCH", "PAUSE", "RESUME", "RESET"};
+static const char *const words[] = {"STATUS", "WATCH", "PAUSE", "RESUME", "RESET", "SAVE"};
 
 static const struct {
 	const char *word, *sentence;
 } later[] = {
-    {"SAVE", "?SAVE is not done by the daemon: run `facet save ADDRESS -o FILE`"},
     {"RECORD", "?RECORD comes in a later version"},
     {"SWEEP", "?SWEEP comes in a later version: set `sweep` in the configuration"},
     {"SEEK", "?SEEK comes in a later version"},
@@ -27,7 +26,7 @@ const char *control_name(enum control_word word)
 
 bool control_changes(enum control_word word)
 {
-	return word == CONTROL_PAUSE || word == CONTROL_RESUME || word == CONTROL_RESET;
+	return word == CONTROL_PAUSE || word == CONTROL_RESUME || word == CONTROL_RESET || word == CONTROL_SAVE;
 }
 
 bool control_plays(enum control_word word)
@@ -53,7 +52,18 @@ static int find_word(const char *word, enum control_word *ret, char error[200])
 			snprintf(error, 200, "%s", later[i].sentence);
 			return -ENOTSUP;
 		}
-	return refuse(error, "not a command: say ?STATUS, ?WATCH={\"enable\":true}, ?PAUSE, ?RESUME or ?RESET");
+	return refuse(error, "not a command: say ?STATUS, ?WATCH={\"enable\":true}, ?PAUSE, ?RESUME, ?RESET or "
+	                     "?SAVE={\"file\":\"NAME.ply\"}");
+}
+
+static int read_file(json_t *arguments, struct control_command *command, char error[200])
+{
+	const char *file = json_string_value(json_object_get(arguments, "file"));
+
+	if (!file || strlen(file) >= sizeof(command->file))
+		return refuse(error, "?SAVE={\"file\":\"NAME.ply\"}: a name is needed, of less than 128 bytes");
+	snprintf(command->file, sizeof(command->file), "%s", file);
+	return 0;
 }
 
 static int read_arguments(json_t *arguments, struct control_command *command, char error[200])
@@ -67,7 +77,7 @@ static int read_arguments(json_t *arguments, struct control_command *command, ch
 		return refuse(error, "`enable` is true or false");
 	if (enable)
 		command->enable = json_is_true(enable);
-	return 0;
+	return command->word == CONTROL_SAVE ? read_file(arguments, command, error) : 0;
 }
 
 static json_t *load(const char *text, size_t len)

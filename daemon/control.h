@@ -9,12 +9,14 @@
 #include "daemon/worker.h"
 
 #define CONTROL_LINE_MAX (64u << 10)
+#define CONTROL_FILE_MAX 128
 
-enum control_word { CONTROL_STATUS, CONTROL_WATCH, CONTROL_PAUSE, CONTROL_RESUME, CONTROL_RESET };
+enum control_word { CONTROL_STATUS, CONTROL_WATCH, CONTROL_PAUSE, CONTROL_RESUME, CONTROL_RESET, CONTROL_SAVE };
 
 struct control_command {
 	enum control_word word;
 	bool enable; /* of WATCH */
+	char file[CONTROL_FILE_MAX]; /* of SAVE; longer ones are refused */
 };
 
 /* Parses `?WORD`, `?WORD={...}` or `{"command": "WORD", ...}`, with or without a `;` at the end. 0, -ENOTSUP where the

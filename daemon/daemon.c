@@ -595,12 +595,23 @@ static void begin_list(struct daemon *d)
 	memset(&d->keep, 0, sizeof(d->keep));
 }
 
+static bool save(struct daemon *d, const char *file, char error[200])
+{
+	char sentence[SNAPSHOT_ERROR_MAX];
+
+	if (snapshot_save(d->snapshots, file, sentence))
+		return true;
+	snprintf(error, 200, "%.199s", sentence);
+	return false;
+}
+
 static bool do_command(void *ctx, const struct control_command *command, char error[200])
 {
 	struct daemon *d = ctx;
 
-	(void)error;
 	log_line(LOG_INFO, "a client asks for %s", control_name(command->word));
+	if (command->word == CONTROL_SAVE)
+		return save(d, command->file, error);
 	if (command->word == CONTROL_RESET) {
 		pipeline_reset(d->pipeline);
 		worker_reset(d->worker);

@@ -762,6 +762,20 @@ struct publisher *web_publisher(const struct web_connection *c)
 	return c->web->publisher;
 }
 
+/* While a language is opened its request is still there. */
+bool web_query(const struct web_connection *c, const char *name, char *ret, size_t cap)
+{
+	char with_equals[40], value[256];
+	const char *found;
+
+	snprintf(with_equals, sizeof(with_equals), "%s=", name);
+	found = c->state ? NULL : lws_get_urlarg_by_name(c->wsi, with_equals, value, sizeof(value));
+	if (!found)
+		return false;
+	snprintf(ret, cap, "%s", found);
+	return true;
+}
+
 void web_hold(struct web_connection *c, bool on)
 {
 	lws_rx_flow_control(c->wsi, on ? 0 : 1);

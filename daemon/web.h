@@ -85,7 +85,7 @@ bool web_loopback(const struct web *);
 void web_wake_one(struct web_connection *); /* `next` has something, or soon may */
 const struct web_rights *web_rights(const struct web_connection *);
 /* Value of `name` in the query of the address, e.g. ?encoding=protobuf, copied to `ret` and cut to `cap` with its NUL; false
- * where it is not. */
+ * where it is not. While `open` runs only: the request is forgotten then. */
 bool web_query(const struct web_connection *, const char *name, char *ret, size_t cap);
 const struct server_host *web_server_host(const struct web_connection *);
 const struct buffer *web_status(const struct web_connection *); /* the newest STATUS */

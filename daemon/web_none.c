@@ -113,6 +113,15 @@ struct publisher *web_publisher(const struct web_connection *c)
 	return NULL;
 }
 
+bool web_query(const struct web_connection *c, const char *name, char *ret, size_t cap)
+{
+	(void)c;
+	(void)name;
+	(void)ret;
+	(void)cap;
+	return false;
+}
+
 void web_hold(struct web_connection *c, bool on)
 {
 	(void)c;

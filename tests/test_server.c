@@ -404,8 +404,8 @@ static void what_comes_later_is_refused_by_name(void **state)
 	(void)state;
 	peer_unix(&peer);
 	peer_line(&peer,
-	          "?SAVE={\"file\":\"x\"}\n?RECORD\n?SEEK={}\n?SWEEP={\n?NONE\n{}\n?WATCH=[]\n?WATCH={\"enable\":1}\n");
-	expect_heard(&peer, "facet save");
+	          "?SAVE={}\n?RECORD\n?SEEK={}\n?SWEEP={\n?NONE\n{}\n?WATCH=[]\n?WATCH={\"enable\":1}\n");
+	expect_heard(&peer, "a name is needed");
 	expect_heard(&peer, "?RECORD comes");
 	expect_heard(&peer, "?SEEK comes");
 	expect_heard(&peer, "?SWEEP comes");

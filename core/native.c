@@ -165,9 +165,14 @@ void native_put_patch(struct buffer *b, const struct patch *patch)
 	put_indices(b, patch);
 }
 
-void native_put_coded(struct buffer *b, const uint8_t *patches, size_t len)
+void native_put_coded_head(struct buffer *b, size_t len)
 {
 	put_head(b, NATIVE_CODED, len);
+}
+
+void native_put_coded(struct buffer *b, const uint8_t *patches, size_t len)
+{
+	native_put_coded_head(b, len);
 	buffer_append(b, patches, len);
 }
 

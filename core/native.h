@@ -87,6 +87,7 @@ void native_put_want(struct buffer *, const struct native_want *); /* pads: no l
 void native_put_begin(struct buffer *, const struct native_begin *);
 void native_put_patch(struct buffer *, const struct patch *);
 void native_put_coded(struct buffer *, const uint8_t *patches, size_t len); /* as coded_put_patch made them, in a row */
+void native_put_coded_head(struct buffer *, size_t len); /* of the same: `len` bytes of patches are to follow */
 void native_put_remove(struct buffer *, struct patch_key);
 void native_put_step(struct buffer *, enum native_type commit_or_abort, uint64_t step);
 void native_put_json(struct buffer *, const char *text, size_t len);

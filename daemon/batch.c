@@ -83,12 +83,14 @@ static void sift_down(struct batch_waiting *heap, size_t n, size_t at)
 	}
 }
 
-/* Keeps the nearest BATCH_WINDOW of all it is given: a heap, the farthest on top, once it is full. */
-static size_t keep_nearest(struct batch_waiting *heap, size_t n, struct batch_waiting waiting)
+/* Keeps the nearest of all it is given, `window` at most: a heap, the farthest on top, once it is full. */
+static size_t keep_nearest(struct batch_scratch *scratch, size_t n, struct batch_waiting waiting)
 {
-	if (n < BATCH_WINDOW) {
+	struct batch_waiting *heap = scratch->nearest;
+
+	if (n < scratch->window) {
 		heap[n++] = waiting;
-		for (size_t i = n / 2; n == BATCH_WINDOW && i > 0; i--)
+		for (size_t i = n / 2; n == scratch->window && i > 0; i--)
 			sift_down(heap, n, i - 1);
 	} else if (compare_waiting(&waiting, &heap[0]) < 0) {
 		heap[0] = waiting;
@@ -124,7 +126,7 @@ static int fill_window(struct batch *batch, const struct sheets *sheets, struct 
 		waiting.rank = rank_of(batch, entry->key, part);
 		if (is_sent(batch, waiting.rank, entry->key))
 			continue;
-		n = keep_nearest(scratch->nearest, n, waiting);
+		n = keep_nearest(scratch, n, waiting);
 		if (ret_parts)
 			ret_parts[part]++;
 	}

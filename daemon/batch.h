@@ -38,6 +38,7 @@ struct batch {
 
 /* Shared by all batches: memory in which a window is made. */
 struct batch_scratch {
+	size_t window; /* 1 .. BATCH_WINDOW: so many are held at a time */
 	struct batch_waiting nearest[BATCH_WINDOW];
 };
 

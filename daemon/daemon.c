@@ -271,10 +271,13 @@ static void set_device_timer(struct daemon *d)
 static bool take_row(void *ctx, struct row *row)
 {
 	struct daemon *d = ctx;
+	struct vec3 at = row->n > 0 ? row->beam[0].origin : (struct vec3){0};
 	bool taken = !d->paused && worker_row(d->worker, row, pipeline_arrival_ns(d->pipeline));
 
 	d->rows_paused += d->paused;
 	d->queue_full += !d->paused && !taken;
+	if (publisher_robot(d->publisher, at.x, at.y, at.z))
+		server_wake(d->server);
 	return taken;
 }
 

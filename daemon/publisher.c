@@ -19,6 +19,8 @@
 #include <stdlib.h>
 #include <string.h>
 
+#include "core/coded.h"
+
 /* Clients */
 
 static uint64_t behind(const struct publisher_client *client)
@@ -367,7 +369,7 @@ struct publisher_client *publisher_join(struct publisher *p, const struct native
 struct publisher_client *publisher_join_walk(struct publisher *p, const struct native_want *want,
                                              enum publisher_form form)
 {
-	assert(form == PUBLISHER_NATIVE || p->params.encoder[form].encode);
+	assert(form <= PUBLISHER_PACKED || p->params.encoder[form].encode);
 	return join(p, NULL, want, form);
 }
 
@@ -399,9 +401,15 @@ void publisher_client_stats(const struct publisher_client *client, struct publis
 	ret->queued = client->batch.pinned;
 	ret->bytes = client_bytes(client);
 	if (stream) {
-		ret->queued += stream->out_len - stream->out_at + stream->source_left + stream->json.len;
+		ret->queued += native_stream_queued(stream);
 		ret->bytes += stream->json.cap + stream->small.cap;
 	}
+}
+
+static void encode_coded(void *ctx, struct buffer *ret, const struct patch *patch)
+{
+	(void)ctx;
+	coded_put_patch(ret, patch);
 }
 
 struct publisher *publisher_create(const struct publisher_params *params)
@@ -415,6 +423,8 @@ struct publisher *publisher_create(const struct publisher_params *params)
 		p->params.pinned_max = PUBLISHER_PINNED_MAX;
 	p->sheets.forms_max = params->forms_bytes ? params->forms_bytes : PUBLISHER_FORMS_BYTES;
 	memcpy(p->sheets.encoder, params->encoder, sizeof(params->encoder));
+	p->sheets.encoder[PUBLISHER_CODED].encode = encode_coded;
+	p->scratch.window = params->window ? params->window : BATCH_WINDOW;
 	p->generation = 1;
 	return p;
 }

@@ -22,7 +22,8 @@
 
 enum publisher_form {
 	PUBLISHER_NATIVE, /* a PATCH frame */
-	PUBLISHER_CODED,  /* the frame of a compactly coded patch */
+	PUBLISHER_CODED,  /* a patch of core/coded.h, without a frame */
+	PUBLISHER_PACKED, /* a PATCH frame compressed with zstd */
 	PUBLISHER_SCENE_JSON,
 	PUBLISHER_SCENE_PROTOBUF,
 	PUBLISHER_FORMS
@@ -39,7 +40,8 @@ struct publisher_params {
 	double cell_m;
 	size_t pinned_max;                                 /* 0: PUBLISHER_PINNED_MAX */
 	size_t forms_bytes;                                /* 0: PUBLISHER_FORMS_BYTES */
-	struct publisher_encoder encoder[PUBLISHER_FORMS]; /* that of NATIVE is not asked */
+	size_t window; /* of a batch, in patches: at most as many as 0 means, which is right for everything but tests */
+	struct publisher_encoder encoder[PUBLISHER_FORMS]; /* of the scenes; the first three need none */
 };
 
 struct publisher;

@@ -8,13 +8,16 @@
 
 /* The wire of a client of the native protocol. */
 struct native_stream {
-	uint32_t greeted;      /* the generation whose HELLO was sent; 0: none */
-	const uint8_t *source; /* the frame being taken over into `out` */
+	uint32_t greeted;    /* the generation whose HELLO was sent; 0: none */
+	struct buffer small; /* a small frame, or the head of one; it comes before `source` */
+	size_t small_at;
+	const uint8_t *source; /* of what a walk handed out */
 	size_t source_left;
-	struct buffer small, json; /* one small frame; JSON messages that wait for their turn */
-	uint32_t bytes_per_s;      /* 0: all */
-	int64_t next_ns;           /* not before then, by that rate */
-	bool reason_sent, broken;  /* broken: no memory even for a small frame */
+	struct buffer json;       /* messages that wait for their turn */
+	uint32_t bytes_per_s;     /* 0: all */
+	int64_t next_ns;          /* not before then, by that rate */
+	bool reason_sent, broken; /* broken: no memory even for a small frame */
+	size_t open_at;           /* in `out`: a frame of coded patches that takes more of them */
 	size_t out_at, out_len;
 	uint8_t out[STREAM_OUT_BYTES];
 };
@@ -65,6 +68,7 @@ void publisher_client_let_go(struct publisher_client *);
 /* There is something to begin a batch for. */
 bool publisher_client_has_news(const struct publisher_client *);
 
+size_t native_stream_queued(const struct native_stream *);
 struct native_stream *native_stream_create(void); /* NULL when memory is out */
 void native_stream_destroy(struct native_stream *);
 void native_stream_want(struct publisher_client *, const struct native_want *);

@@ -49,18 +49,39 @@ static void form_drop(struct sheets *s, struct form *form)
 	form_unref(form);
 }
 
-/* Into the scratch buffer; false when memory is out. */
-static bool encode(struct sheets *s, const struct sheet *sheet, enum publisher_form kind)
+static void pack(struct sheets *s, const struct sheet *sheet)
+{
+	if (!s->packer)
+		s->packer = native_packer_create();
+	if (s->packer)
+		native_put_packed(s->packer, &s->scratch, sheet->bytes, sheet->len);
+	else
+		s->scratch.error = -ENOMEM;
+}
+
+/* Its own frame is valid: only memory can fail. */
+static void encode(struct sheets *s, const struct sheet *sheet, enum publisher_form kind)
 {
 	struct native_message message;
 	char error[128];
 
-	if (native_decode(sheet->bytes, sheet->len, &message, error) < 0)
-		return false; /* its own frame is valid */
-	s->scratch.len = 0;
+	if (native_decode(sheet->bytes, sheet->len, &message, error) < 0) {
+		s->scratch.error = -ENOMEM;
+		return;
+	}
 	s->encoder[kind].encode(s->encoder[kind].ctx, &s->scratch, message.patch);
 	native_message_finish(&message);
+}
+
+/* Into the scratch buffer; false when memory is out. */
+static bool make_form(struct sheets *s, const struct sheet *sheet, enum publisher_form kind)
+{
+	s->scratch.len = 0;
 	s->stats.encodes[kind]++;
+	if (kind == PUBLISHER_PACKED)
+		pack(s, sheet);
+	else
+		encode(s, sheet, kind);
 	if (!s->scratch.error)
 		return true;
 	buffer_finish(&s->scratch);
@@ -72,7 +93,7 @@ static struct form *form_create(struct sheets *s, struct sheet *sheet, enum publ
 {
 	struct form *form = NULL;
 
-	if (encode(s, sheet, kind))
+	if (make_form(s, sheet, kind))
 		form = malloc(sizeof(*form) + s->scratch.len);
 	if (!form)
 		return NULL;
@@ -91,7 +112,7 @@ struct form *sheets_form(struct sheets *s, struct sheet *sheet, enum publisher_f
 {
 	struct form *form = sheet->form[kind];
 
-	assert(kind != PUBLISHER_NATIVE && s->encoder[kind].encode);
+	assert(kind == PUBLISHER_PACKED || s->encoder[kind].encode);
 	if (!form) {
 		form = form_create(s, sheet, kind);
 	} else if (form->newer) {
@@ -128,7 +149,7 @@ struct sheet *sheet_create(struct sheets *s, const struct patch *patch, uint32_t
 
 	s->scratch.len = 0;
 	native_put_patch(&s->scratch, patch);
-	if (s->scratch.error == 0)
+	if (!s->scratch.error)
 		sheet = malloc(sizeof(*sheet) + s->scratch.len);
 	if (sheet) {
 		*sheet = (struct sheet){.references = 1,
@@ -287,5 +308,6 @@ void sheets_finish(struct sheets *s)
 {
 	sheets_clear(s);
 	buffer_finish(&s->scratch);
+	native_packer_destroy(s->packer);
 	free(s->slot);
 }

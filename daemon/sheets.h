@@ -46,6 +46,7 @@ struct sheets {
 	struct form *form_oldest, *form_newest; /* kept ones, by their last use */
 	size_t forms_max;
 	struct publisher_encoder encoder[PUBLISHER_FORMS];
+	struct native_packer *packer; /* of PUBLISHER_PACKED; NULL: not needed so far */
 	struct buffer scratch;
 	struct publisher_stats stats; /* patches, bytes, faces, pinned, encodes, forms */
 };

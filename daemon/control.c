@@ -9,12 +9,11 @@
 #include <stdlib.h>
 #include <string.h>
 
-static const char *const words[] = {"STATUS", "WATCH", "PAUSE", "RESUME", "RESET", "SAVE"};
+static const char *const words[] = {"STATUS", "WATCH", "PAUSE", "RESUME", "RESET", "SAVE", "RECORD"};
 
 static const struct {
 	const char *word, *sentence;
 } later[] = {
-    {"RECORD", "?RECORD comes in a later version"},
     {"SWEEP", "?SWEEP comes in a later version: set `sweep` in the configuration"},
     {"SEEK", "?SEEK comes in a later version"},
 };
@@ -26,7 +25,8 @@ const char *control_name(enum control_word word)
 
 bool control_changes(enum control_word word)
 {
-	return word == CONTROL_PAUSE || word == CONTROL_RESUME || word == CONTROL_RESET || word == CONTROL_SAVE;
+	return word == CONTROL_PAUSE || word == CONTROL_RESUME || word == CONTROL_RESET || word == CONTROL_SAVE ||
+	       word == CONTROL_RECORD;
 }
 
 bool control_plays(enum control_word word)
@@ -53,7 +53,7 @@ static int find_word(const char *word, enum control_word *ret, char error[200])
 			return -ENOTSUP;
 		}
 	return refuse(error, "not a command: say ?STATUS, ?WATCH={\"enable\":true}, ?PAUSE, ?RESUME, ?RESET or "
-	                     "?SAVE={\"file\":\"NAME.ply\"}");
+	                     "?SAVE={\"file\":\"NAME.ply\"} or ?RECORD={\"enable\":true}");
 }
 
 static int read_file(json_t *arguments, struct control_command *command, char error[200])
@@ -68,7 +68,7 @@ static int read_file(json_t *arguments, struct control_command *command, char er
 
 static int read_arguments(json_t *arguments, struct control_command *command, char error[200])
 {
-	json_t *enable = json_object_get(arguments, "enable");
+	json_t *enable = json_object_get(arguments, "enable"), *stream = json_object_get(arguments, "stream");
 
 	command->enable = true;
 	if (arguments && !json_is_object(arguments))
@@ -77,6 +77,9 @@ static int read_arguments(json_t *arguments, struct control_command *command, ch
 		return refuse(error, "`enable` is true or false");
 	if (enable)
 		command->enable = json_is_true(enable);
+	if (stream && !json_is_boolean(stream))
+		return refuse(error, "`stream` is true or false");
+	command->stream = command->word == CONTROL_RECORD && json_is_true(stream);
 	return command->word == CONTROL_SAVE ? read_file(arguments, command, error) : 0;
 }
 
@@ -168,7 +171,10 @@ void control_put_version(struct buffer *b)
 
 void control_put_answer(struct buffer *b, const struct control_command *command)
 {
-	if (command->word == CONTROL_WATCH)
+	if (command->word == CONTROL_RECORD)
+		put(b, json_pack("{s:s, s:b, s:b}", "class", "RECORD", "enable", command->enable, "stream",
+		                 command->stream));
+	else if (command->word == CONTROL_WATCH)
 		put(b, json_pack("{s:s, s:b}", "class", "WATCH", "enable", command->enable));
 	else
 		put(b, json_pack("{s:s, s:s}", "class", "OK", "command", control_name(command->word)));
@@ -235,6 +241,18 @@ void control_put_saved_event(struct buffer *b, const char *map, const char *file
 	if (error)
 		json_object_set_new(json, "error", text_json(error));
 	put(b, json);
+}
+
+void control_put_record_event(struct buffer *b, const struct recorder_notice *notice)
+{
+	put(b,
+	    json_pack("{s:s, s:s, s:o, s:o}", "class", "RECORD", "state", notice->state, "file",
+	              notice->file[0] ? text_json(notice->file) : json_null(), "message", text_json(notice->sentence)));
+}
+
+void control_put_end(struct buffer *b, const char *reason)
+{
+	put(b, json_pack("{s:s, s:s, s:s}", "class", "RECORD", "state", "ended", "message", reason));
 }
 
 static json_t *integer(uint64_t value)
@@ -345,6 +363,19 @@ static json_t *devices_json(const struct control_status *s)
 	return list;
 }
 
+static json_t *record_json(const struct control_status *s)
+{
+	const struct recorder_status *record = &s->record;
+
+	return json_pack("{s:b, s:b, s:o, s:I, s:I, s:I, s:I, s:I, s:I, s:o, s:I}", "enabled", record->enabled,
+	                 "recording", record->recording, "file",
+	                 record->file[0] ? text_json(record->file) : json_null(), "bytes", (json_int_t)record->bytes,
+	                 "messages", (json_int_t)record->messages, "files", (json_int_t)record->files, "gaps",
+	                 (json_int_t)record->gaps, "dropped", (json_int_t)record->dropped, "queued",
+	                 (json_int_t)record->queued, "error", record->error[0] ? text_json(record->error) : json_null(),
+	                 "streams", (json_int_t)s->streams);
+}
+
 static json_t *clients_json(const struct control_status *s)
 {
 	json_t *list = json_array();
@@ -391,6 +422,7 @@ void control_put_status(struct buffer *b, const struct control_status *s)
 	                    json_pack("{s:f, s:f, s:I}", "p50", s->latency_p50_ms, "p99", s->latency_p99_ms, "n",
 	                              (json_int_t)s->latencies));
 	json_object_set_new(json, "devices", devices_json(s));
+	json_object_set_new(json, "record", record_json(s));
 	json_object_set_new(json, "clients", clients_json(s));
 	put(b, json);
 }

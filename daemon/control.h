@@ -5,17 +5,27 @@
 #include "core/model.h"
 #include "core/native.h"
 #include "core/pose_track.h"
+#include "daemon/recorder.h"
 #include "daemon/supervisor.h"
 #include "daemon/worker.h"
 
 #define CONTROL_LINE_MAX (64u << 10)
 #define CONTROL_FILE_MAX 128
 
-enum control_word { CONTROL_STATUS, CONTROL_WATCH, CONTROL_PAUSE, CONTROL_RESUME, CONTROL_RESET, CONTROL_SAVE };
+enum control_word {
+	CONTROL_STATUS,
+	CONTROL_WATCH,
+	CONTROL_PAUSE,
+	CONTROL_RESUME,
+	CONTROL_RESET,
+	CONTROL_SAVE,
+	CONTROL_RECORD
+};
 
 struct control_command {
 	enum control_word word;
-	bool enable; /* of WATCH */
+	bool enable;                 /* of WATCH, RECORD */
+	bool stream;                 /* of RECORD: to this client */
 	char file[CONTROL_FILE_MAX]; /* of SAVE; longer ones are refused */
 };
 
@@ -67,6 +77,8 @@ struct control_status {
 		struct pose_track_status track; /* of those that say where the robot is, or how it moves */
 		struct decoder_counters counters;
 	} device[CONFIG_DEVICES_MAX];
+	struct recorder_status record;
+	size_t streams; /* recordings that clients take */
 	size_t clients;
 	const struct control_client *client;
 };
@@ -85,6 +97,10 @@ const char *control_on_jump(enum pose_track_on_jump); /* "keep", ... */
 void control_put_map_event(struct buffer *, const uint8_t map_id[16], uint32_t generation, const uint8_t before[16]);
 /* An ended map was saved as `file`; or (`file` NULL) was not, and why. */
 void control_put_saved_event(struct buffer *, const char *map, const char *file, const char *error);
+/* A recording began, ended or failed. */
+void control_put_record_event(struct buffer *, const struct recorder_notice *);
+/* The last line behind a recording that a client took. */
+void control_put_end(struct buffer *, const char *reason);
 /* The wall clock was set by `step_ns` and is now `ahead_ns` ahead of the times of the daemon. */
 void control_put_clock_event(struct buffer *, int64_t step_ns, int64_t ahead_ns);
 

@@ -23,12 +23,14 @@
 #include <unistd.h>
 #include <uv.h>
 
+#include "config/redact.h"
 #include "daemon/archive.h"
 #include "daemon/control.h"
 #include "daemon/journal.h"
 #include "daemon/log.h"
 #include "daemon/notify.h"
 #include "daemon/publisher.h"
+#include "daemon/recorders.h"
 #include "daemon/server.h"
 #include "daemon/snapshot.h"
 #include "daemon/supervisor.h"
@@ -70,6 +72,11 @@ struct daemon {
 	struct journal *journal;
 	struct journal_sink keep; /* empty without a journal */
 	bool journal_failed;
+	struct recorders *recorders;
+	uint8_t
+	    list_map_id[16]; /* of the map that is recorded: after a jump it is ahead of map_id until the worker is */
+	uint32_t list_generation;
+	bool list_ahead;
 	struct watcher *watcher[CONFIG_DEVICES_MAX];
 
 	uv_async_t results;
@@ -123,6 +130,8 @@ static void tell_clients(struct daemon *d, struct buffer *message)
 	if (d->server)
 		server_event(d->server, (const char *)message->data, message->len);
 	web_event(d->web, (const char *)message->data, message->len);
+	if (d->recorders)
+		recorders_event(d->recorders, (const char *)message->data, message->len);
 	buffer_finish(message);
 }
 
@@ -206,6 +215,7 @@ static void look_for_step(struct daemon *d)
 	d->wall_offset_ns = offset_ns;
 	if (d->keep.clock)
 		d->keep.clock(d->keep.ctx, offset_ns - d->clock_offset_ns);
+	recorders_clock(d->recorders, offset_ns - d->clock_offset_ns);
 	pipeline_clock(d->pipeline, offset_ns - d->clock_offset_ns);
 	control_put_clock_event(&message, step_ns, offset_ns - d->clock_offset_ns);
 	tell_clients(d, &message);
@@ -220,6 +230,7 @@ static void on_record(void *ctx, const struct record *record)
 		look_for_step(d);
 	if (d->keep.record)
 		d->keep.record(d->keep.ctx, record);
+	recorders_record(d->recorders, record);
 	pipeline_handle(d->pipeline, record);
 }
 
@@ -285,9 +296,9 @@ static void on_not_applied(void *ctx, uint64_t number, const char *reason)
 {
 	struct daemon *d = ctx;
 
-	(void)reason; /* counted by those who know it: the assembler, take_row */
 	if (d->keep.not_applied)
 		d->keep.not_applied(d->keep.ctx, number);
+	recorders_skip(d->recorders, number, d->paused && strcmp(reason, "queue full") == 0 ? "paused" : reason);
 }
 
 static void on_flush(void *ctx)
@@ -306,6 +317,15 @@ static void on_data(void *ctx, int device, int64_t t_ns)
 }
 
 static void begin_list(struct daemon *d);
+
+static void make_map_id(struct daemon *d, uint8_t ret[16])
+{
+	const int64_t t_ns = now(d);
+
+	memset(ret, 0, 16);
+	if (getrandom(ret, 16, GRND_NONBLOCK) < 0)
+		memcpy(ret, &t_ns, sizeof(t_ns)); /* early at boot: the time will do */
+}
 
 /* One line a second at most: a localisation that cannot decide jumps with every pose. */
 static void log_jump(struct daemon *d, int device, const struct pose_jump *jump)
@@ -341,6 +361,8 @@ static void on_jump(void *ctx, int device, const struct pose_jump *jump)
 		return;
 	pipeline_reset(d->pipeline);
 	worker_end(d->worker);
+	make_map_id(d, d->list_map_id);
+	d->list_ahead = true;
 	begin_list(d);
 }
 
@@ -352,6 +374,7 @@ static void on_tick(uv_timer_t *timer)
 	look_for_step(d);
 	if (d->keep.tick)
 		d->keep.tick(d->keep.ctx, t_ns);
+	recorders_tick(d->recorders, t_ns);
 	pipeline_tick(d->pipeline, t_ns);
 }
 
@@ -368,14 +391,6 @@ static void note_latencies(struct daemon *d, const struct worker_result *result)
 
 	for (size_t i = 0; i < result->arrivals; i++)
 		d->latency_ms[d->latencies++ % LATENCIES] = (double)(t_ns - result->arrival_ns[i]) / 1e6;
-}
-
-static void make_map_id(struct daemon *d)
-{
-	const int64_t t_ns = now(d);
-
-	if (getrandom(d->map_id, sizeof(d->map_id), GRND_NONBLOCK) < 0)
-		memcpy(d->map_id, &t_ns, sizeof(t_ns)); /* early at boot: the time will do */
 }
 
 static void on_saved(void *ctx, const struct archive_result *result)
@@ -418,7 +433,10 @@ static void end_map(struct daemon *d)
 	memcpy(before, d->map_id, sizeof(before));
 	for (int i = 0; i < 16; i++)
 		snprintf(map + 2 * i, 3, "%02x", before[i]);
-	make_map_id(d);
+	if (!d->list_ahead)
+		make_map_id(d, d->list_map_id);
+	d->list_ahead = false;
+	memcpy(d->map_id, d->list_map_id, sizeof(d->map_id));
 	old = publisher_begin_map(d->publisher, d->map_id);
 	publisher_stats(d->publisher, &stats);
 	control_put_map_event(&message, d->map_id, stats.generation, before);
@@ -564,6 +582,7 @@ static void fill_status(struct daemon *d, struct control_client client[CLIENTS_S
 	s.rss_bytes = resident_bytes();
 	fill_latency(d, &s);
 	fill_devices(d, &s);
+	s.streams = recorders_status(d->recorders, &s.record);
 	s.clients = list_clients(d, client);
 	*ret = s;
 }
@@ -589,9 +608,11 @@ static void put_metrics(void *ctx, struct buffer *ret)
 	web_metrics_put(ret, &s, &map);
 }
 
-/* What is kept from here on gives the map that begins here. */
+/* What is kept and recorded from here on gives the map that begins here. */
 static void begin_list(struct daemon *d)
 {
+	d->list_generation++;
+	recorders_map(d->recorders);
 	if (!d->keep.begin || journal_begin(&d->keep, d->pipeline) == 0)
 		return;
 	log_line(LOG_ERR, "out of memory: the journal ends here");
@@ -608,11 +629,77 @@ static bool save(struct daemon *d, const char *file, char error[200])
 	return false;
 }
 
+/* Recordings */
+
+static bool snapshot(void *ctx, struct recording_begin *ret, struct buffer *ret_bytes)
+{
+	struct daemon *d = ctx;
+
+	ret->log_ns = now(d);
+	ret->generation = d->list_generation;
+	memcpy(ret->map_id, d->list_map_id, sizeof(ret->map_id));
+	return journal_snapshot(d->pipeline, ret_bytes) == 0;
+}
+
+static void on_recorder(void *ctx, const struct recorder_notice *notice)
+{
+	struct buffer message = {0};
+
+	log_line(notice->priority, "%s", notice->sentence);
+	control_put_record_event(&message, notice);
+	tell_clients(ctx, &message);
+}
+
+static void on_streams(void *ctx)
+{
+	struct daemon *d = ctx;
+
+	if (d->server)
+		server_streams(d->server);
+}
+
+static struct recorder *begin_stream(void *ctx, char error[200])
+{
+	struct daemon *d = ctx;
+
+	log_line(LOG_INFO, "a client records");
+	return recorders_stream(d->recorders, error);
+}
+
+static void end_stream(void *ctx, struct recorder *stream)
+{
+	recorders_stream_end(((struct daemon *)ctx)->recorders, stream);
+}
+
+static bool begin_recorders(struct daemon *d, const char *config_text)
+{
+	struct recorders_host host = {d, snapshot, on_recorder, on_streams};
+	struct buffer text = {0};
+	int r = config_text ? config_redact(config_text, strlen(config_text), &text) : 0;
+
+	buffer_append(&text, "", 1);
+	if (r == 0 && text.error == 0)
+		d->recorders = recorders_create(&d->loop, d->config, (const char *)text.data, &host);
+	buffer_finish(&text);
+	return d->recorders != NULL;
+}
+
+static void note_command(struct daemon *d, enum control_word word)
+{
+	char text[64];
+	int n = snprintf(text, sizeof(text), "{\"command\":\"%s\"}", control_name(word));
+
+	recorders_control(d->recorders, text, (size_t)n);
+}
+
 static bool do_command(void *ctx, const struct control_command *command, char error[200])
 {
 	struct daemon *d = ctx;
 
 	log_line(LOG_INFO, "a client asks for %s", control_name(command->word));
+	note_command(d, command->word);
+	if (command->word == CONTROL_RECORD)
+		return recorders_enable(d->recorders, command->enable, error);
 	if (command->word == CONTROL_SAVE)
 		return save(d, command->file, error);
 	if (command->word == CONTROL_RESET) {
@@ -729,6 +816,7 @@ static void close_all(struct daemon *d)
 	snapshots_stop(d->snapshots);
 	worker_destroy(d->worker); /* before the handle that its thread speaks to */
 	d->worker = NULL;
+	recorders_stop(d->recorders);
 	for (size_t i = 0; i < sizeof(handles) / sizeof(handles[0]); i++)
 		uv_close(handles[i], NULL);
 }
@@ -755,7 +843,7 @@ static void begin_handles(struct daemon *d)
 		uv_timer_start(&d->watchdog, on_watchdog, watchdog_ms, watchdog_ms);
 }
 
-static bool begin_parts(struct daemon *d)
+static bool begin_parts(struct daemon *d, const char *config_text)
 {
 	const struct config *config = d->config;
 	struct publisher_params publisher = {.cell_m = config->map.cell_m};
@@ -784,7 +872,8 @@ static bool begin_parts(struct daemon *d)
 	d->supervisor = supervisor_create(config, d->driver, &host);
 	d->archive = archive_create(&d->loop, config->map.archive, config->map.cell_m, on_saved, d);
 	d->snapshots = snapshots_create(&d->loop, d->publisher, config->map.archive, on_snapshot_saved, d);
-	return d->publisher && d->worker && d->pipeline && d->supervisor && d->archive && d->snapshots;
+	return d->publisher && d->worker && d->pipeline && d->supervisor && d->archive && d->snapshots &&
+	       begin_recorders(d, config_text);
 }
 
 /* A web that the configuration names must be possible. The default one need not: a second daemon on this machine, or a build
@@ -807,7 +896,7 @@ static int begin_web(struct daemon *d, const struct server_host *server)
 
 static int begin(struct daemon *d, const struct daemon_options *options)
 {
-	struct server_host host = {d, now, put_status, do_command, log_server};
+	struct server_host host = {d, now, put_status, do_command, log_server, begin_stream, end_stream};
 
 	if (options->journal) {
 		d->journal = journal_create(options->journal, d->error);
@@ -815,7 +904,7 @@ static int begin(struct daemon *d, const struct daemon_options *options)
 			return -EIO;
 		journal_sink(d->journal, &d->keep);
 	}
-	if (!begin_parts(d)) {
+	if (!begin_parts(d, options->config_text)) {
 		snprintf(d->error, 320, "out of memory; give the machine more, or set a smaller map.memory");
 		return -ENOMEM;
 	}
@@ -861,7 +950,8 @@ int daemon_run(const struct config *config, const struct daemon_options *options
 	d->error = error;
 	d->wall_offset_ns = d->clock_offset_ns = wall_clock_first_offset();
 	d->started_ns = now(d);
-	make_map_id(d);
+	make_map_id(d, d->map_id);
+	memcpy(d->list_map_id, d->map_id, sizeof(d->map_id));
 	begin_handles(d);
 	r = begin(d, options);
 	if (r == 0) {
@@ -882,6 +972,7 @@ int daemon_run(const struct config *config, const struct daemon_options *options
 	publisher_destroy(d->publisher);
 	uv_loop_close(&d->loop);
 	archive_destroy(d->archive);
+	recorders_destroy(d->recorders);
 	free(d);
 	return r;
 }

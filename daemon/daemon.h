@@ -5,7 +5,8 @@
 #include "config/config.h"
 
 struct daemon_options {
-	const char *journal; /* keep what the loop hands to the pipeline in this file; NULL: nowhere */
+	const char *config_text; /* what the configuration was read from; recordings carry it, without secrets */
+	const char *journal;     /* keep what the loop hands to the pipeline in this file; NULL: nowhere */
 };
 
 /* Runs until SIGINT or SIGTERM (orderly, within 3 s). 0, or -errno with one sentence. */

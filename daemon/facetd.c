@@ -99,7 +99,8 @@ static const char *config_path(const struct arguments *arguments)
 	return environment && *environment ? environment : CONFIG_DEFAULT;
 }
 
-static bool load(const char *path, struct config *ret)
+/* The text is the caller's. */
+static bool load(const char *path, struct config *ret, char **ret_text)
 {
 	struct config_error error = {0};
 	size_t len = 0;
@@ -109,7 +110,7 @@ static bool load(const char *path, struct config *ret)
 	if (!text)
 		return false;
 	r = config_read(text, len, path, ret, &error);
-	free(text);
+	*ret_text = text;
 	if (r < 0)
 		fprintf(stderr, "facetd: %s\n", r == -ENOMEM ? "out of memory" : error.text);
 	return r == 0;
@@ -129,21 +130,26 @@ int main(int argc, char **argv)
 	static struct config config;
 	struct arguments arguments = {0};
 	struct daemon_options run = {0};
-	char error[320] = "";
+	char error[320] = "", *text = NULL;
+	int r;
 
 	argp_program_version = "facetd " FACET_VERSION;
 	argp_err_exit_status = 2;
 	argp_parse(&argp, argc, argv, 0, NULL, &arguments);
-	if (!load(config_path(&arguments), &config))
+	if (!load(config_path(&arguments), &config, &text)) {
+		free(text);
 		return 1;
+	}
 	if (arguments.check) {
 		printf("%s: the configuration is right\n", config_path(&arguments));
+		free(text);
 		return 0;
 	}
 	run.journal = arguments.journal;
-	if (daemon_run(&config, &run, error) < 0) {
+	run.config_text = text;
+	r = daemon_run(&config, &run, error);
+	free(text);
+	if (r < 0)
 		fprintf(stderr, "facetd: %s\n", error);
-		return 1;
-	}
-	return 0;
+	return r < 0;
 }

@@ -150,24 +150,32 @@ void journal_sink(struct journal *journal, struct journal_sink *ret)
 	*ret = (struct journal_sink){journal, keep_begin, keep_record, keep_tick, keep_not_applied, keep_clock};
 }
 
-int journal_begin(const struct journal_sink *sink, struct pipeline *pipeline)
+int journal_snapshot(struct pipeline *pipeline, struct buffer *ret)
 {
 	char error[160];
 	struct state s;
-	uint8_t *bytes;
-	size_t cap;
+	size_t len;
 
 	state_save(&s, NULL, 0);
 	pipeline_state(pipeline, &s, error);
-	cap = s.at;
-	bytes = malloc(cap);
-	if (!bytes)
+	len = s.at;
+	if (!buffer_reserve(ret, len))
 		return -ENOMEM;
-	state_save(&s, bytes, cap);
+	state_save(&s, ret->data + ret->len, len);
 	pipeline_state(pipeline, &s, error);
-	sink->begin(sink->ctx, bytes, cap);
-	free(bytes);
+	ret->len += len;
 	return 0;
+}
+
+int journal_begin(const struct journal_sink *sink, struct pipeline *pipeline)
+{
+	struct buffer bytes = {0};
+	int r = journal_snapshot(pipeline, &bytes);
+
+	if (r == 0)
+		sink->begin(sink->ctx, bytes.data, bytes.len);
+	buffer_finish(&bytes);
+	return r;
 }
 
 int journal_error(const struct journal *journal)

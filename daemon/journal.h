@@ -3,6 +3,7 @@
 #ifndef FACET_DAEMON_JOURNAL_H
 #define FACET_DAEMON_JOURNAL_H
 
+#include "core/model.h"
 #include "daemon/pipeline.h"
 
 struct journal_sink {
@@ -14,6 +15,9 @@ struct journal_sink {
 	void (*not_applied)(void *ctx, uint64_t number);
 	void (*clock)(void *ctx, int64_t ahead_ns);
 };
+
+/* The pipeline's state as it stands. 0 or -ENOMEM. */
+int journal_snapshot(struct pipeline *, struct buffer *ret);
 
 /* Says `begin` with a snapshot of the pipeline as it stands. 0 or -ENOMEM. */
 int journal_begin(const struct journal_sink *, struct pipeline *);

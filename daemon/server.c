@@ -25,12 +25,14 @@
 #include "daemon/listener.h"
 
 #define READ_BYTES   16384
-#define ACCEPTS_MAX  16          /* in one turn */
-#define MESSAGES_MAX 16          /* of one client, heard in one turn */
-#define DRAINS_MAX   16          /* reads that are thrown away at the end */
-#define TICK_MS      100         /* deadlines and limited rates */
-#define TICKS_STATUS 10          /* a status a second, to those who watch */
-#define STATUS_NS    100000000ll /* a status is so old at most: building one walks the whole daemon and reads /proc */
+#define ACCEPTS_MAX  16           /* in one turn */
+#define MESSAGES_MAX 16           /* of one client, heard in one turn */
+#define DRAINS_MAX   16           /* reads that are thrown away at the end */
+#define TICK_MS      100          /* deadlines and limited rates */
+#define TICKS_STATUS 10           /* a status a second, to those who watch */
+#define STREAM_BYTES 65536        /* of a recording in one piece */
+#define STREAM_NS    5000000000ll /* for a recording to end in order */
+#define STATUS_NS    100000000ll  /* a status is so old at most: building one walks the whole daemon and reads /proc */
 
 enum kind { KIND_UNKNOWN, KIND_NATIVE, KIND_LINES };
 
@@ -51,6 +53,7 @@ struct connection {
 	size_t out_at;
 	uint64_t sent;
 	struct publisher_client *client; /* native only */
+	struct recorder *stream;         /* lines only: `out` is pieces of a recording from now on */
 };
 
 struct door {
@@ -106,6 +109,9 @@ static void close_connection(struct connection *c)
 	if (c->client)
 		publisher_leave(c->client);
 	c->client = NULL;
+	if (c->stream)
+		s->host.stream_end(s->host.ctx, c->stream);
+	c->stream = NULL;
 	uv_poll_stop(&c->poll);
 	/* Unread input would turn the end into a reset, which may overtake the reason. */
 	for (int i = 0; i < DRAINS_MAX && recv(c->fd, bytes, sizeof(bytes), MSG_DONTWAIT) > 0; i++)
@@ -117,10 +123,47 @@ static void close_connection(struct connection *c)
 
 /* Writing */
 
+static void end_stream(struct connection *c, const char *reason)
+{
+	struct server *s = c->server;
+	struct buffer text = {0};
+
+	s->host.stream_end(s->host.ctx, c->stream);
+	c->stream = NULL;
+	control_put_end(&text, reason);
+	buffer_append(&c->out, text.data, text.len);
+	buffer_append(&c->out, "\n", 1);
+	buffer_finish(&text);
+	c->dismissed = true;
+	c->deadline_ns = s->host.now(s->host.ctx) + STREAM_NS;
+}
+
+/* The next piece of a recording: u32 length, bytes; length 0: the end, then a line that says why. */
+static void fill_stream(struct connection *c)
+{
+	uint32_t n = 0;
+	char reason[320];
+	bool ended;
+
+	buffer_append(&c->out, &n, 4);
+	ended = recorder_take(c->stream, STREAM_BYTES, &c->out, reason);
+	if (c->out.error)
+		return;
+	n = (uint32_t)(c->out.len - 4);
+	for (int i = 0; i < 4; i++)
+		c->out.data[i] = (uint8_t)(n >> 8 * i);
+	if (ended)
+		end_stream(c, reason);
+	else if (n == 0)
+		c->out.len = 0;
+}
+
 static size_t next_bytes(struct connection *c, int64_t t_ns, const uint8_t **ret)
 {
 	if (c->client)
 		return publisher_peek(c->client, t_ns, ret);
+	if (c->out.len == 0 && c->stream)
+		fill_stream(c);
 	if (c->out.len == 0)
 		return 0;
 	*ret = c->out.data + c->out_at;
@@ -160,7 +203,7 @@ static bool is_done(const struct connection *c)
 
 	if (c->client)
 		return publisher_done(c->client);
-	return c->out.error || (c->out.len == 0 && (c->dismissed || (c->ended && !unheard)));
+	return c->out.error || (c->out.len == 0 && !c->stream && (c->dismissed || (c->ended && !unheard)));
 }
 
 /* Its next message may be heard, if there is one: there is room for the answer. */
@@ -266,6 +309,27 @@ static void say_status(struct connection *c)
 		say(c, status_text(s));
 }
 
+static void begin_stream(struct connection *c, const struct control_command *command)
+{
+	struct server *s = c->server;
+	struct buffer text = {0};
+	char error[200];
+
+	if (c->kind != KIND_LINES) {
+		say_error(c, "a recording goes to a client of JSON lines: run `facet record`");
+		return;
+	}
+	c->stream = s->host.stream(s->host.ctx, error);
+	if (!c->stream) {
+		say_error(c, error);
+		return;
+	}
+	c->watches = false;
+	control_put_answer(&text, command);
+	put_line(c, &text);
+	buffer_finish(&text);
+}
+
 static void do_command(struct connection *c, const struct control_command *command)
 {
 	struct server *s = c->server;
@@ -274,6 +338,10 @@ static void do_command(struct connection *c, const struct control_command *comma
 
 	if (control_changes(command->word) && !c->local) {
 		say_error(c, "commands that change something are taken on the unix socket only");
+		return;
+	}
+	if (command->stream) {
+		begin_stream(c, command);
 		return;
 	}
 	if (control_changes(command->word) && !s->host.command(s->host.ctx, command, error)) {
@@ -298,7 +366,9 @@ static void hear_command(struct connection *c, const char *text, size_t len)
 	struct control_command command;
 	char error[200];
 
-	if (control_parse(text, len, &command, error) < 0)
+	if (c->stream) /* whatever is said while a recording is taken: it is to end */
+		recorder_enable(c->stream, false);
+	else if (control_parse(text, len, &command, error) < 0)
 		say_error(c, error);
 	else
 		do_command(c, &command);
@@ -462,7 +532,9 @@ static bool receive(struct connection *c)
 			return false;
 		}
 		c->ended = true;
-		c->deadline_ns = c->server->host.now(c->server->host.ctx) + SERVER_LINGER_NS;
+		if (c->stream)
+			recorder_enable(c->stream, false);
+		c->deadline_ns = c->server->host.now(c->server->host.ctx) + (c->stream ? STREAM_NS : SERVER_LINGER_NS);
 		return true;
 	}
 	buffer_append(&c->in, bytes, (size_t)n);
@@ -609,6 +681,17 @@ void server_wake(struct server *s)
 	}
 }
 
+void server_streams(struct server *s)
+{
+	struct connection *next;
+
+	for (struct connection *c = s->connections; c; c = next) {
+		next = c->next;
+		if (c->stream && !(c->events & UV_WRITABLE))
+			pump(c);
+	}
+}
+
 void server_event(struct server *s, const char *text, size_t len)
 {
 	struct buffer b = {0};
@@ -636,7 +719,10 @@ size_t server_clients(const struct server *s, struct control_client *ret, size_t
 		if (c->client)
 			publisher_client_stats(c->client, &stats);
 		ret[n].id = c->id;
-		ret[n].kind = c->kind == KIND_NATIVE ? "native" : c->kind == KIND_LINES ? "lines" : "new";
+		ret[n].kind = c->kind == KIND_NATIVE  ? "native"
+		              : c->stream             ? "recording"
+		              : c->kind == KIND_LINES ? "lines"
+		                                      : "new";
 		snprintf(ret[n].address, sizeof(ret[n].address), "%.60s", c->from);
 		ret[n].sent = c->sent;
 		ret[n].step = stats.step;

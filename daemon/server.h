@@ -23,6 +23,9 @@ struct server_host {
 	/* Does a command that changes something; false with a sentence when it cannot. */
 	bool (*command)(void *ctx, const struct control_command *, char error[200]);
 	void (*log)(void *ctx, int priority, const char *text);
+	/* A recording whose bytes the client takes; NULL with a sentence. It ends with the connection, or before. */
+	struct recorder *(*stream)(void *ctx, char error[200]);
+	void (*stream_end)(void *ctx, struct recorder *);
 };
 
 struct server;
@@ -35,6 +38,7 @@ void server_stop(struct server *);
 void server_destroy(struct server *);
 
 void server_wake(struct server *);                                /* the publisher has news */
+void server_streams(struct server *);                             /* recordings have bytes for who takes them */
 void server_event(struct server *, const char *text, size_t len); /* one JSON text, to all who watch */
 
 /* Where listener `i` listens, e.g. for a port the system chose; NULL beyond the last. */

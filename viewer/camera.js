@@ -4,7 +4,7 @@ import { MOUSE, OrthographicCamera, PerspectiveCamera, TOUCH, Vector3 } from 'th
 import { OrbitControls } from 'three/examples/jsm/controls/OrbitControls.js';
 
 const VIEW = new Vector3(-0.62, -0.85, 0.98).normalize(); // from the south-west, above
-const EASE_S = 0.25;
+const EASE_S = 0.25, MARGIN = 0.1;
 
 export class Camera {
   constructor(element, still) {
@@ -54,28 +54,30 @@ export class Camera {
     this.top.zoom = 1;
   }
 
-  resize(width, height) {
+  // `aside`: pixels on the right that the panel covers; the picture's middle is that of the rest.
+  resize(width, height, aside) {
     this.free.aspect = width / height;
-    this.free.updateProjectionMatrix();
-    this.ratio = width / height;
+    this.ratio = (width - aside) / height;
+    this.wide = width / (width - aside);
+    for (const camera of [this.free, this.top]) camera.setViewOffset(width, height, aside / 2, 0, width, height);
     this.frameTop();
   }
 
   frameTop() {
     const half = this.spread / 2, [x, y] = this.ratio > 1 ? [half * this.ratio, half] : [half, half / this.ratio];
-    Object.assign(this.top, { left: -x, right: x, top: y, bottom: -y });
+    Object.assign(this.top, { left: -x * this.wide, right: x * this.wide, top: y, bottom: -y });
     this.top.updateProjectionMatrix();
   }
 
-  // `robot`: where it is (a Vector3) or null; `bounds` of the map; `dt` since the last frame, s.
-  update(bounds, robot, dt) {
-    if (!this.touched && !bounds.isEmpty()) this.frame(bounds, this.still ? 1 : 1 - Math.exp(-dt / EASE_S));
+  // `robot`: where it is (a Vector3) or null; `bounds` of the map, `points` all over it; `dt` since the last frame, s.
+  update(bounds, points, robot, dt) {
+    if (!this.touched && points.length) this.frame(bounds, points, this.still ? 1 : 1 - Math.exp(-dt / EASE_S));
     if (this.mode === 'follow' && robot) this.follow(robot, dt);
     this.robot = robot?.clone() ?? null;
     (this.mode === 'top' ? this.plan : this.turn).update(dt);
   }
 
-  frame(bounds, share) {
+  frame(bounds, points, share) {
     const centre = bounds.getCenter(new Vector3());
     if (this.mode === 'top') {
       const size = bounds.getSize(new Vector3());
@@ -87,25 +89,27 @@ export class Camera {
       this.top.position.copy(this.plan.target).setZ(bounds.max.z + 100);
       return;
     }
-    const distance = this.distanceFor(bounds, centre);
-    this.turn.target.lerp(centre, share);
-    const wanted = centre.clone().addScaledVector(VIEW, distance);
-    this.free.position.lerp(wanted, share);
+    const { eye, target } = this.standFor(points, centre);
+    this.turn.target.lerp(target, share);
+    this.free.position.lerp(eye, share);
   }
 
-  // From how far all eight corners are in sight, with a margin.
-  distanceFor(bounds, centre) {
-    const right = new Vector3().crossVectors(new Vector3(0, 0, 1), VIEW).normalize(), up = new Vector3().crossVectors(VIEW, right);
-    const tanY = Math.tan((this.free.fov * Math.PI) / 360), tanX = tanY * this.free.aspect;
-    let distance = 3;
-    for (let i = 0; i < 8; i++) {
-      const corner = new Vector3(i & 1 ? bounds.max.x : bounds.min.x, i & 2 ? bounds.max.y : bounds.min.y,
-        i & 4 ? bounds.max.z : bounds.min.z).sub(centre);
-      const depth = corner.dot(VIEW);
-      distance = Math.max(distance, depth + (1.06 * Math.abs(corner.dot(right))) / tanX,
-        depth + (1.06 * Math.abs(corner.dot(up))) / tanY);
-    }
-    return distance;
+  // The nearest place from which all points are in sight along VIEW: each says how far aside the eye may be, by its depth.
+  standFor(points, centre) {
+    const right = new Vector3(-VIEW.y, VIEW.x, 0).normalize(), up = new Vector3().crossVectors(VIEW, right);
+    const tanY = Math.tan((this.free.fov * Math.PI) / 360) * (1 - MARGIN), tanX = tanY * this.ratio;
+    const fit = (axis, tan) => {
+      let low = -Infinity, high = Infinity;
+      for (const point of points) {
+        low = Math.max(low, point.dot(axis) + tan * point.dot(VIEW));
+        high = Math.min(high, point.dot(axis) - tan * point.dot(VIEW));
+      }
+      return { away: (low - high) / (2 * tan), aside: (low + high) / 2 };
+    };
+    const x = fit(right, tanX), y = fit(up, tanY), depth = centre.dot(VIEW);
+    const away = Math.max(x.away, y.away, depth + 4);
+    const eye = VIEW.clone().multiplyScalar(away).addScaledVector(right, x.aside).addScaledVector(up, y.aside);
+    return { eye, target: eye.clone().addScaledVector(VIEW, depth - away) };
   }
 
   follow(robot, dt) {

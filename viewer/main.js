@@ -11,7 +11,6 @@ import { FrameReader, writeWant } from './native.js';
 import { $, element, Panel, span } from './panel.js';
 import { Robot } from './robot.js';
 import { MapScene } from './scene.js';
-import { showBacks } from './shader.js';
 import { finish, stillCounts } from './still.js';
 import { Transport } from './transport.js';
 
@@ -87,8 +86,8 @@ function rights() {
 let section = Infinity, measuring = false;
 
 function setSection(value) { // 0..1000 of the map's height
-  const { min, max } = map.bounds;
-  section = value >= 1000 || map.bounds.isEmpty() ? Infinity : min.z + (value / 1000) * (max.z - min.z);
+  const { min, max } = map.frame;
+  section = value >= 1000 || map.frame.isEmpty() ? Infinity : min.z + (value / 1000) * (max.z - min.z);
   map.material.uniforms.section.value = Math.min(section, 1e9);
   $('section-at').textContent = section === Infinity ? 'off' : `${section.toFixed(2)} m`;
 }
@@ -123,7 +122,7 @@ function setMeasuring(on) {
 }
 
 function pickAt(clientX, clientY) {
-  const found = picker.pick((2 * clientX) / innerWidth - 1, 1 - (2 * clientY) / innerHeight, camera.current, section);
+  const found = picker.pick((2 * clientX) / innerWidth - 1, 1 - (2 * clientY) / innerHeight, camera.current, section, $('backs').checked);
   if (measuring) {
     if (found) measure.add(found.point);
     $('hint').hidden = measure.points.length === 2;
@@ -160,7 +159,7 @@ function saveMenu() {
 }
 
 const flip = { wire: (on) => (map.material.uniforms.wire.value = on), edges: (on) => (map.material.uniforms.edges.value = on),
-  backs: (on) => showBacks(map.material, on), laser: (on) => (robot.shown.laser = on), robot: (on) => (robot.shown.robot = on),
+  backs: (on) => (map.material.uniforms.backs.value = on), laser: (on) => (robot.shown.laser = on), robot: (on) => (robot.shown.robot = on),
   trail: (on) => (robot.shown.trail = on) };
 const keys = { 1: () => setCamera('free'), 2: () => setCamera('follow'), 3: () => setCamera('top'), f: () => camera.home(),
   m: () => setMeasuring(!measuring), w: () => $('wire').click(), e: () => $('edges').click(), l: () => $('laser').click(),
@@ -195,7 +194,8 @@ let before = performance.now(), frames = 0, second = before, received = 0, pictu
 function resize() {
   renderer.setPixelRatio(still ? 1 : Math.min(devicePixelRatio, 2));
   renderer.setSize(innerWidth, innerHeight, false);
-  camera.resize(innerWidth, innerHeight);
+  const sheet = $('panel').getBoundingClientRect();
+  camera.resize(innerWidth, innerHeight, !still && sheet.width < innerWidth / 2 ? innerWidth - sheet.left : 0);
 }
 
 function tellState(now) {
@@ -217,6 +217,7 @@ function everySecond(now) {
   const seconds = (now - second) / 1000, total = link.received + (live?.link.received ?? 0);
   panel.own({ triangles: mirror.triangles, bytesPerSecond: (total - received) / seconds, fps: frames / seconds });
   [second, frames, received] = [now, 0, total];
+  map.measure(mirror.patches);
   legend();
 }
 
@@ -236,11 +237,11 @@ function robotTime(now) {
 }
 
 function draw(dt, now) {
-  map.update(!mirror.batch, camera.current.position, still ? Infinity : undefined);
+  if (map.update(!mirror.batch, camera.current.position, dt) && map.frame.isEmpty()) map.measure(mirror.patches);
   if (live) robot.update(live);
   const place = live?.robot;
-  camera.update(map.bounds, place ? camera.free.position.clone().setFromMatrixPosition(place) : null, dt);
-  grid.update(map.bounds);
+  camera.update(map.frame, map.points, place ? camera.free.position.clone().setFromMatrixPosition(place) : null, dt);
+  grid.update(map.frame);
   map.prepare(camera.current.position, still ? map.latest : robotTime(now));
   renderer.render(scene, camera.current);
 }
@@ -260,6 +261,7 @@ function frame(now) {
 function stillFrame() {
   if (!mirror.commits || mirror.batch || !status) return setTimeout(stillFrame, 20);
   map.update(true, camera.current.position, Infinity);
+  map.measure(mirror.patches);
   if (query.has('section')) setSection(1000 * +query.get('section'));
   draw(0, 0);
   draw(0, 0);

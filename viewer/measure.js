@@ -21,11 +21,12 @@ export class Picker {
     this.ray = new Raycaster();
   }
 
-  // `x`, `y`: -1..1 on the screen. Null: nothing is there.
-  pick(x, y, camera, section) {
+  // `x`, `y`: -1..1 on the screen; `backs`: also sides that face away. Null: nothing is there.
+  pick(x, y, camera, section, backs) {
     this.ray.setFromCamera(new Vector2(x, y), camera);
     const hits = this.ray.intersectObjects(this.map.group.children, false);
-    const hit = hits.find(({ point }) => point.z <= section); // three leaves out sides that are not shown
+    const { direction } = this.ray.ray;
+    const hit = hits.find(({ point, face }) => point.z <= section && (backs || face.normal.dot(direction) <= 0));
     if (!hit) return null;
     const found = this.map.faceOf(hit);
     return found && { point: hit.point, normal: hit.face.normal.clone(), ...found };

@@ -3,11 +3,12 @@
 // crack, never a long frame. The first map, and a stage that takes too long, are shown chunk by chunk.
 import { BufferAttribute, BufferGeometry, Box3, Group, Mesh, Sphere, Vector3 } from 'three';
 import { PATCHES, PATCH_UNITS, buildChunk, chunkKeyOf } from './chunk.js';
+import { mainBody } from './extent.js';
 import { nameOf } from './mirror.js';
 import { SMOOTH } from './colours.js';
 import { mapMaterial } from './shader.js';
 
-const BUDGET_MS = 5, PATIENCE_MS = 250;
+const BUDGET_MS = 5, FIRST_MS = 25, PATIENCE_MS = 250;
 
 export class MapScene {
   constructor() {
@@ -20,7 +21,10 @@ export class MapScene {
     this.epoch = null; // s; stamps count from here
     this.latest = 0;
     this.whole = false; // a first map was committed
-    this.bounds = new Box3();
+    this.bounds = new Box3(); // of what is drawn
+    this.frame = new Box3(); // of what a picture should show
+    this.points = []; // the middles of its patches
+    this.measured = 0; // patches, then
     this.drawn = 0; // triangles
   }
 
@@ -62,6 +66,8 @@ export class MapScene {
     this.drawn = 0;
     this.whole = false;
     this.bounds.makeEmpty();
+    this.frame.makeEmpty();
+    this.measured = 0;
   }
 
   discard(chunk) {
@@ -72,8 +78,10 @@ export class MapScene {
     chunk.mesh = null;
   }
 
-  // Once a frame. `whole`: the mirror stands at a commit, so what is dirty fits together. True when something changed.
-  update(whole, eye, budgetMs = BUDGET_MS) {
+  // Once a frame that took `dt` s. `whole`: the mirror stands at a commit, so what is dirty fits together. True when
+  // something changed. Where frames are slow anyway the budget is a fifth of them.
+  update(whole, eye, dt) {
+    const budgetMs = dt === Infinity ? dt : Math.max(this.whole ? BUDGET_MS : FIRST_MS, Math.min(200 * dt, 50));
     if (!this.stage && this.dirty.size && (whole || !this.whole)) this.begin(eye);
     if (!this.stage) return false;
     const { stage } = this, begun = performance.now();
@@ -160,6 +168,17 @@ export class MapScene {
     this.bounds.union(box);
   }
 
+  // What a picture should show: the patches that hang together, without specks that were seen through a window.
+  measure(patches) {
+    if (this.bounds.isEmpty() || patches.size === this.measured) return;
+    this.measured = patches.size;
+    const side = (PATCH_UNITS / 256) * this.cell;
+    const { low, high, keys } = mainBody([...patches.values()].map(({ key }) => key));
+    this.frame.set(new Vector3(...low).multiplyScalar(side), new Vector3(...high).addScalar(1).multiplyScalar(side));
+    this.frame.intersect(this.bounds);
+    this.points = keys.map((key) => new Vector3(...key).addScalar(0.5).multiplyScalar(side));
+  }
+
   // Which patch, plane and class a hit of the raycaster is on.
   faceOf({ object, faceIndex }) {
     let left = faceIndex;
@@ -176,6 +195,6 @@ export class MapScene {
     uniforms.eye.value.copy(eye);
     uniforms.now.value = t - (this.epoch ?? t);
     uniforms.ageSpan.value = Math.min(Math.max(uniforms.now.value, 10), 600);
-    if (!this.bounds.isEmpty()) uniforms.heights.value.set(this.bounds.min.z, this.bounds.max.z);
+    if (!this.frame.isEmpty()) uniforms.heights.value.set(this.frame.min.z, this.frame.max.z);
   }
 }

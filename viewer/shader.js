@@ -1,6 +1,6 @@
 // The one material of the map: every colour mode, edges and wireframe, the section. Changing the look uploads nothing.
 // Colours are display values throughout (no linear workflow), as in the style sheet beside them.
-import { GLSL3, RawShaderMaterial, DoubleSide, FrontSide, Vector2, Vector3 } from 'three';
+import { GLSL3, RawShaderMaterial, DoubleSide, Vector2, Vector3 } from 'three';
 import { CLASS_COLOURS, RAMP, channels } from './colours.js';
 
 const vertexShader = `
@@ -29,7 +29,7 @@ void main() {
 const fragmentShader = `
 precision highp float;
 uniform int mode;
-uniform bool wire, edges;
+uniform bool wire, edges, backs;
 uniform float section, now, ageSpan;
 uniform vec2 heights;
 uniform vec3 eye, classes[9], ramp[5];
@@ -50,10 +50,10 @@ vec3 rampColour(float x) {
   int i = int(min(x, 3.0));
   return mix(ramp[i], ramp[i + 1], x - float(i));
 }
-vec3 plaster(vec3 n) { // by where a surface faces: floors warm, ceilings cool, walls between
-  vec3 wall = mix(vec3(0.70, 0.75, 0.79), vec3(0.80, 0.80, 0.77), 0.5 + 0.5 * n.x);
-  return n.z > 0.0 ? mix(wall, vec3(0.83, 0.77, 0.66), smoothstep(0.5, 0.95, n.z))
-                   : mix(wall, vec3(0.56, 0.63, 0.72), smoothstep(0.5, 0.95, -n.z));
+vec3 plaster(vec3 n) { // by where a surface faces: floors sand, ceilings blue-grey, walls warm and cool by turns
+  vec3 wall = mix(vec3(0.64, 0.71, 0.77), vec3(0.86, 0.84, 0.80), n.y * n.y);
+  return n.z > 0.0 ? mix(wall, vec3(0.71, 0.66, 0.57), smoothstep(0.5, 0.95, n.z))
+                   : mix(wall, vec3(0.52, 0.60, 0.70), smoothstep(0.5, 0.95, -n.z));
 }
 vec3 baseColour(vec3 n) {
   if (mode == 2) return classes[int(min(face.x, 8.0))];
@@ -72,15 +72,20 @@ float lineAlong(vec3 bars, vec3 wanted, float width) { // 1 on the wanted edges,
 void main() {
   if (at.z > section) discard;
   vec3 flatNormal = normalize(cross(dFdx(at), dFdy(at)));
+  if (!gl_FrontFacing && !backs) { // walls seen from behind are a veil, floors and ceilings nothing: a doll's house
+    ivec2 p = ivec2(gl_FragCoord.xy);
+    if (abs(flatNormal.z) > 0.6 || (p.x & 1) != 0 || ((p.y + (p.x >> 1)) & 1) != 0) discard;
+  }
   vec3 toEye = normalize(eye - at);
   vec3 n = mode == 1 && dot(smoothNormal, smoothNormal) > 0.01 ? normalize(smoothNormal) : flatNormal;
   if (!gl_FrontFacing && mode == 1) n = -n;
   vec3 base = baseColour(gl_FrontFacing ? n : -n);
   float key = max(dot(n, normalize(vec3(-0.45, -0.62, 0.64))), 0.0);
-  float fill = max(dot(n, normalize(vec3(0.75, 0.35, 0.25))), 0.0);
-  float light = 0.54 + 0.10 * n.z + 0.34 * key + 0.16 * fill + 0.06 * max(dot(n, toEye), 0.0);
+  float fill = max(dot(n, normalize(vec3(0.80, 0.35, 0.15))), 0.0);
+  float light = 0.56 + 0.06 * n.z + 0.36 * key + 0.14 * fill + 0.06 * max(dot(n, toEye), 0.0);
+  light *= mix(1.0, mix(0.82, 1.0, smoothstep(0.0, 0.7, at.z - heights.x)), 1.0 - abs(n.z)); // walls darken to their feet
   vec3 lit = base * light;
-  if (!gl_FrontFacing) lit = mix(vec3(dot(lit, vec3(0.33))), lit, 0.4) * 0.62;
+  if (!gl_FrontFacing) lit = mix(vec3(dot(lit, vec3(0.33))), lit, 0.4) * (backs ? 0.62 : 0.8);
   float edgeBits = face.w;
   vec3 wanted = vec3(mod(edgeBits, 2.0) >= 1.0, mod(edgeBits, 4.0) >= 2.0, edgeBits >= 4.0);
   if (edges) lit = mix(lit, lit * 0.30, 0.85 * lineAlong(corner, wanted, 0.9));
@@ -92,15 +97,11 @@ const vectors = (colours) => colours.map((hex) => new Vector3(...channels(hex)))
 
 export function mapMaterial() {
   return new RawShaderMaterial({
-    glslVersion: GLSL3, vertexShader, fragmentShader, side: FrontSide,
+    glslVersion: GLSL3, vertexShader, fragmentShader, side: DoubleSide,
     uniforms: {
-      mode: { value: 0 }, wire: { value: false }, edges: { value: true }, section: { value: 1e9 }, now: { value: 0 },
+      mode: { value: 0 }, wire: { value: false }, edges: { value: true }, backs: { value: false }, section: { value: 1e9 }, now: { value: 0 },
       ageSpan: { value: 60 }, heights: { value: new Vector2(0, 3) }, eye: { value: new Vector3() },
       classes: { value: vectors(CLASS_COLOURS) }, ramp: { value: vectors(RAMP) },
     },
   });
-}
-
-export function showBacks(material, on) {
-  material.side = on ? DoubleSide : FrontSide;
 }

@@ -186,6 +186,14 @@ static bool may(const struct speech *s, enum control_word word)
 	return !control_changes(word) || rights->may_change || (rights->may_play && control_plays(word));
 }
 
+/* Into the answer to ?WATCH: a page offers what it may do, and no more. */
+static void put_rights(struct buffer *answer, const struct web_rights *rights)
+{
+	answer->len--; /* the brace */
+	buffer_printf(answer, ",\"may\":{\"change\":%s,\"play\":%s}}", rights->may_change ? "true" : "false",
+	              rights->may_play ? "true" : "false");
+}
+
 static void do_command(struct speech *s, enum way way, const struct control_command *command)
 {
 	const struct server_host *host = web_server_host(s->connection);
@@ -215,6 +223,8 @@ static void do_command(struct speech *s, enum way way, const struct control_comm
 		return;
 	}
 	control_put_answer(&text, command);
+	if (command->word == CONTROL_WATCH)
+		put_rights(&text, web_rights(s->connection));
 	say(s, way, &text);
 	buffer_finish(&text);
 }

@@ -69,6 +69,11 @@ export class Camera {
     this.top.updateProjectionMatrix();
   }
 
+  // Of the plan.
+  metresPerPixel(height) {
+    return (this.top.top - this.top.bottom) / this.top.zoom / height;
+  }
+
   // `robot`: where it is (a Vector3) or null; `bounds` of the map, `points` all over it; `dt` since the last frame, s.
   update(bounds, points, robot, dt) {
     if (!this.touched && points.length) this.frame(bounds, points, this.still ? 1 : 1 - Math.exp(-dt / EASE_S));

@@ -3,9 +3,10 @@ import { ColorManagement, LinearSRGBColorSpace, Scene, WebGLRenderer } from 'thr
 import { Camera } from './camera.js';
 import { MODES } from './colours.js';
 import { Grid } from './grid.js';
+import { lengthText } from './length.js';
 import { Link, takeToken } from './link.js';
 import { Live } from './live.js';
-import { lengthText, Measure, Picker, tell } from './measure.js';
+import { Measure, Picker, tell } from './measure.js';
 import { Mirror } from './mirror.js';
 import { FrameReader, writeWant } from './native.js';
 import { $, element, Panel, span } from './panel.js';
@@ -189,7 +190,7 @@ function wireUp() {
 
 // ---- what is seen ----
 
-let before = performance.now(), frames = 0, second = before, received = 0, pictureAt = null, committed = 0;
+let before = performance.now(), frames = 0, second = before, received = 0, pictureAt = null, committed = 0, firstMs = null;
 
 function resize() {
   renderer.setPixelRatio(still ? 1 : Math.min(devicePixelRatio, 2));
@@ -244,6 +245,7 @@ function draw(dt, now) {
   grid.update(map.frame);
   map.prepare(camera.current.position, still ? map.latest : robotTime(now));
   renderer.render(scene, camera.current);
+  if (firstMs === null && map.drawn) firstMs = performance.now();
 }
 
 function frame(now) {
@@ -275,6 +277,21 @@ setCamera(query.get('camera') ?? 'free');
 addEventListener('resize', resize);
 resize();
 document.body.classList.toggle('still', still);
-globalThis.viewer = { mirror, map, camera, live, robot, measure, counts: () => stillCounts(mirror, map), status: () => status };
+// For tests and the console.
+// A place on the screen, in pixels, where a click hits the map; `up`: the least z of its normal; `from`: pixels it is away
+// from the last picked point at least.
+function somewhere(up = -1, from = 0) {
+  const last = measure.points[0]?.clone().project(camera.current);
+  const pixel = ({ x, y }) => ({ x: ((x + 1) / 2) * innerWidth, y: ((1 - y) / 2) * innerHeight });
+  for (let i = 1; i < 400; i++) {
+    const x = ((i * 0.618034) % 1) * 1.1 - 0.75, y = ((i * 0.754878) % 1) * 1.3 - 0.65;
+    const found = picker.pick(x, y, camera.current, section, $('backs').checked), at = pixel({ x, y });
+    if (found && found.normal.z >= up && (!last || Math.hypot(at.x - pixel(last).x, at.y - pixel(last).y) >= from))
+      return { x: Math.round(at.x), y: Math.round(at.y) };
+  }
+  return null;
+}
+globalThis.viewer = { somewhere, get firstMs() { return firstMs; }, mirror, map, camera, live, robot, measure,
+  counts: () => stillCounts(mirror, map), status: () => status };
 if (still) stillFrame();
 else requestAnimationFrame(frame);

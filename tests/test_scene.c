@@ -59,16 +59,16 @@ static void an_entity_has_its_golden_text(void **state)
 
 	(void)state;
 	scene_put_entity(&b, SCENE_AS_JSON, patch, CELL);
-	expect_text(&b,
-	            "{\"timestamp\":{\"sec\":1700000000,\"nsec\":250000000},\"frame_id\":\"map\",\"id\":\"-1,2,0\","
-	            "\"lifetime\":{\"sec\":0,\"nsec\":0},\"frame_locked\":true,"
-	            "\"metadata\":[{\"key\":\"version\",\"value\":\"77\"}],"
-	            "\"arrows\":[],\"cubes\":[],\"spheres\":[],\"cylinders\":[],\"lines\":[],\"triangles\":["
-	            "{\"pose\":{\"position\":{\"x\":0,\"y\":0,\"z\":0},\"orientation\":{\"x\":0,\"y\":0,\"z\":0,\"w\":1}},"
-	            "\"points\":[{\"x\":-0.8,\"y\":1.6,\"z\":0},{\"x\":-0.8,\"y\":1.65,\"z\":0},"
-	            "{\"x\":-0.75,\"y\":1.6,\"z\":0},{\"x\":-0.8,\"y\":1.6,\"z\":0.8}],"
-	            "\"color\":{\"r\":0.66,\"g\":0.70,\"b\":0.76,\"a\":1},\"colors\":[],"
-	            "\"indices\":[0,1,2,0,2,3,0,3,1,2,1,3]}],\"texts\":[],\"models\":[]}");
+	expect_text(
+	    &b, "{\"timestamp\":{\"sec\":1700000000,\"nsec\":250000000},\"frame_id\":\"map\",\"id\":\"-1,2,0\","
+	        "\"lifetime\":{\"sec\":0,\"nsec\":0},\"frame_locked\":true,"
+	        "\"metadata\":[{\"key\":\"version\",\"value\":\"77\"}],"
+	        "\"arrows\":[],\"cubes\":[],\"spheres\":[],\"cylinders\":[],\"lines\":[],\"triangles\":["
+	        "{\"pose\":{\"position\":{\"x\":0,\"y\":0,\"z\":0},\"orientation\":{\"x\":0,\"y\":0,\"z\":0,\"w\":1}},"
+	        "\"points\":[{\"x\":-0.8,\"y\":1.6,\"z\":0},{\"x\":-0.8,\"y\":1.65,\"z\":0},"
+	        "{\"x\":-0.75,\"y\":1.6,\"z\":0},{\"x\":-0.8,\"y\":1.6,\"z\":0.8}],"
+	        "\"color\":{\"r\":0.66,\"g\":0.70,\"b\":0.76,\"a\":1},\"colors\":[],"
+	        "\"indices\":[0,1,2,0,2,3,0,3,1,2,1,3]}],\"texts\":[],\"models\":[]}");
 	buffer_finish(&b);
 	patch_unref(patch);
 }
@@ -80,12 +80,13 @@ static void an_entity_has_its_golden_bytes(void **state)
 
 	(void)state;
 	scene_put_entity(&b, SCENE_AS_PROTOBUF, patch, 256);
-	expect_bytes(&b, "128a020a0b0880e2cfaa061080e59a7712036d61701a05302c302c3022002801320d0a0776657273696f6e1202373762"
-	                 "db010a0d0a00120921000000000000f03f121b090000000000000000110000000000000000190000000000000000121b"
-	                 "090000000000000000110000000000007040190000000000000000121b09000000000000704011000000000000000019"
-	                 "0000000000000000121b09000000000000000011000000000000000019000000000000b0401a24091f85eb51b81ee53f"
-	                 "11666666666666e63f1952b81e85eb51e83f21000000000000f03f2a3000000000010000000200000000000000020000"
-	                 "0003000000000000000300000001000000020000000100000003000000");
+	expect_bytes(&b,
+	             "128a020a0b0880e2cfaa061080e59a7712036d61701a05302c302c3022002801320d0a0776657273696f6e1202373762"
+	             "db010a0d0a00120921000000000000f03f121b090000000000000000110000000000000000190000000000000000121b"
+	             "090000000000000000110000000000007040190000000000000000121b09000000000000704011000000000000000019"
+	             "0000000000000000121b09000000000000000011000000000000000019000000000000b0401a24091f85eb51b81ee53f"
+	             "11666666666666e63f1952b81e85eb51e83f21000000000000f03f2a3000000000010000000200000000000000020000"
+	             "0003000000000000000300000001000000020000000100000003000000");
 	buffer_finish(&b);
 	patch_unref(patch);
 }
@@ -150,7 +151,8 @@ static void classes_come_apart_and_nothing_is_lost(void **state)
 
 static void an_update_is_deletions_then_entities(void **state)
 {
-	struct patch *patch[3] = {tetrahedron((struct patch_key){1, 0, 0}, 1), tetrahedron((struct patch_key){2, 0, 0}, 1),
+	struct patch *patch[3] = {tetrahedron((struct patch_key){1, 0, 0}, 1),
+	                          tetrahedron((struct patch_key){2, 0, 0}, 1),
 	                          patch_allocate((struct patch_key){3, 0, 0}, 0, 0, 0)};
 	struct buffer b = {0};
 	json_t *update;
@@ -190,10 +192,12 @@ static void positions_are_right_to_a_twentieth_of_a_millimetre(void **state)
 		patch->vertex[0][0] = 1; /* the least there is */
 		scene_put_entity(&b, SCENE_AS_JSON, patch, CELL);
 		entity = json_loadb((char *)b.data, b.len, JSON_DECODE_INT_AS_REAL, &error);
-		point = json_array_get(json_object_get(json_array_get(json_object_get(entity, "triangles"), 0), "points"), 0);
-		assert_true(fabs(json_real_value(json_object_get(point, "x")) -
-		                 (key[i].x * 16.0 + 1.0 / 256) * CELL) <= 0.00005000001);
-		assert_true(fabs(json_real_value(json_object_get(point, "y")) - key[i].y * 16.0 * CELL) <= 0.00005000001);
+		point = json_array_get(
+		    json_object_get(json_array_get(json_object_get(entity, "triangles"), 0), "points"), 0);
+		assert_true(fabs(json_real_value(json_object_get(point, "x")) - (key[i].x * 16.0 + 1.0 / 256) * CELL) <=
+		            0.00005000001);
+		assert_true(fabs(json_real_value(json_object_get(point, "y")) - key[i].y * 16.0 * CELL) <=
+		            0.00005000001);
 		json_decref(entity);
 		patch_unref(patch);
 	}

@@ -26,7 +26,9 @@
 #include "config/redact.h"
 #include "daemon/archive.h"
 #include "daemon/control.h"
+#include "daemon/foxglove_web.h"
 #include "daemon/journal.h"
+#include "daemon/live.h"
 #include "daemon/log.h"
 #include "daemon/notify.h"
 #include "daemon/publisher.h"
@@ -67,6 +69,8 @@ struct daemon {
 	struct supervisor *supervisor;
 	struct server *server;
 	struct web *web; /* NULL: there is none */
+	struct live *live;
+	struct foxglove *foxglove;
 	struct snapshots *snapshots;
 	struct archive *archive;
 	struct journal *journal;
@@ -287,8 +291,10 @@ static bool take_row(void *ctx, struct row *row)
 
 	d->rows_paused += d->paused;
 	d->queue_full += !d->paused && !taken;
-	if (publisher_robot(d->publisher, at.x, at.y, at.z))
+	if (publisher_robot(d->publisher, at.x, at.y, at.z)) {
 		server_wake(d->server);
+		web_wake(d->web);
+	}
 	return taken;
 }
 
@@ -314,6 +320,21 @@ static void on_reply(void *ctx, int device, const struct reply *reply)
 static void on_data(void *ctx, int device, int64_t t_ns)
 {
 	supervisor_data(((struct daemon *)ctx)->supervisor, device, t_ns);
+}
+
+static void on_profile(void *ctx, int device, const struct profile *profile)
+{
+	live_profile(((struct daemon *)ctx)->live, device, profile);
+}
+
+static void on_tilt(void *ctx, int device, const struct tilt *tilt)
+{
+	live_tilt(((struct daemon *)ctx)->live, device, tilt);
+}
+
+static void on_pose(void *ctx, const struct pose *pose)
+{
+	live_pose(((struct daemon *)ctx)->live, pose);
 }
 
 static void begin_list(struct daemon *d);
@@ -843,6 +864,13 @@ static void begin_handles(struct daemon *d)
 		uv_timer_start(&d->watchdog, on_watchdog, watchdog_ms, watchdog_ms);
 }
 
+static void on_log(void *ctx, int priority, const char *text)
+{
+	struct daemon *d = ctx;
+
+	live_log(d->live, now(d), priority, text);
+}
+
 static bool begin_parts(struct daemon *d, const char *config_text)
 {
 	const struct config *config = d->config;
@@ -860,19 +888,28 @@ static bool begin_parts(struct daemon *d, const char *config_text)
 	                             .flush = on_flush,
 	                             .reply = on_reply,
 	                             .data = on_data,
-	                             .jump = on_jump};
+	                             .jump = on_jump,
+	                             .profile = on_profile,
+	                             .tilt = on_tilt,
+	                             .pose = on_pose};
+	struct foxglove_host foxglove = {.ctx = d, .now = now, .time = now, .status = put_status};
 	struct supervisor_host host = {d, watch_device, on_record, log_device};
 
 	memcpy(publisher.map_id, d->map_id, sizeof(publisher.map_id));
 	for (int i = 0; i < config->devices; i++)
 		d->driver[i] = driver_find(config->device[i].driver);
+	foxglove_encoders(&publisher, &config->map.cell_m);
 	d->publisher = publisher_create(&publisher);
+	d->live = live_create(config);
+	d->foxglove = d->publisher && d->live ? foxglove_create(d->publisher, d->live, &foxglove) : NULL;
+	if (d->live)
+		log_listen(on_log, d);
 	d->worker = worker_create(&worker);
 	d->pipeline = pipeline_create(config, &sink);
 	d->supervisor = supervisor_create(config, d->driver, &host);
 	d->archive = archive_create(&d->loop, config->map.archive, config->map.cell_m, on_saved, d);
 	d->snapshots = snapshots_create(&d->loop, d->publisher, config->map.archive, on_snapshot_saved, d);
-	return d->publisher && d->worker && d->pipeline && d->supervisor && d->archive && d->snapshots &&
+	return d->foxglove && d->worker && d->pipeline && d->supervisor && d->archive && d->snapshots &&
 	       begin_recorders(d, config_text);
 }
 
@@ -891,6 +928,7 @@ static int begin_web(struct daemon *d, const struct server_host *server)
 	if (!d->web)
 		return r;
 	web_speak(d->web, &web_native_language, NULL);
+	web_speak(d->web, &foxglove_language, d->foxglove);
 	return web_start(d->web, d->error);
 }
 
@@ -968,6 +1006,9 @@ int daemon_run(const struct config *config, const struct daemon_options *options
 	uv_run(&d->loop, UV_RUN_DEFAULT);
 	/* Snapshots that were being made hold pins until here. */
 	web_destroy(d->web);
+	foxglove_destroy(d->foxglove);
+	log_listen(NULL, NULL);
+	live_destroy(d->live);
 	snapshots_destroy(d->snapshots);
 	publisher_destroy(d->publisher);
 	uv_loop_close(&d->loop);

@@ -4,6 +4,9 @@
 
 #include <syslog.h>
 
+/* Hands the lines that this thread logs to somebody else as well; NULL: no longer. */
+void log_listen(void (*hear)(void *ctx, int priority, const char *text), void *ctx);
+
 void log_line(int priority, const char *format, ...) __attribute__((format(printf, 2, 3)));
 
 #endif

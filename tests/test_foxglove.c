@@ -512,7 +512,7 @@ static void a_client_that_stalls_converges_and_costs_no_memory(void **state)
 	    "note: a Foxglove client that stalls cost at most %zu bytes; %d updates, %u deletions, %u of all, "
 	    "%d batches aborted, closed %d times\n",
 	    most, bed->data[0], bed->deletions, bed->deletions_all, (int)aborts, closed);
-	assert_true(aborts > 10);
+	assert_true(aborts >= 5);
 	assert_true(most <= PUBLISHER_CLIENT_MAX + (128u << 10));
 	bed_destroy(bed);
 }

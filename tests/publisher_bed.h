@@ -24,7 +24,7 @@
 
 static uint64_t random_state;
 
-static uint32_t pick(uint32_t n) /* 0 .. n - 1; xorshift */
+static inline uint32_t pick(uint32_t n) /* 0 .. n - 1; xorshift */
 {
 	random_state ^= random_state << 13;
 	random_state ^= random_state >> 7;
@@ -33,7 +33,7 @@ static uint32_t pick(uint32_t n) /* 0 .. n - 1; xorshift */
 }
 
 /* The patch of a key with a content: its size and its integers follow from both. */
-static struct patch *make_patch(uint32_t key, uint32_t content, uint64_t version, uint32_t side)
+static inline struct patch *make_patch(uint32_t key, uint32_t content, uint64_t version, uint32_t side)
 {
 	static uint16_t vertex[512][3];
 	static uint32_t triangle[512][3];
@@ -68,7 +68,7 @@ struct history {
 	uint32_t side;
 };
 
-static void advance_history(struct history *h, struct publisher *p, uint32_t changes)
+static inline void advance_history(struct history *h, struct publisher *p, uint32_t changes)
 {
 	struct patch *patch[KEYS];
 	uint32_t raw[KEYS];
@@ -91,7 +91,7 @@ static void advance_history(struct history *h, struct publisher *p, uint32_t cha
 }
 
 /* `held` is what make_patch makes, without making it. */
-static bool is_content(const struct patch *held, uint32_t key, uint32_t content, uint32_t side)
+static inline bool is_content(const struct patch *held, uint32_t key, uint32_t content, uint32_t side)
 {
 	uint32_t nv = 3 + content % side;
 	bool same = held->nv == nv && held->nt == nv - 2 && held->nruns == 1;
@@ -104,7 +104,8 @@ static bool is_content(const struct patch *held, uint32_t key, uint32_t content,
 }
 
 /* What `mirror` holds is what of the map of its step lies in the region, and nothing else. */
-static bool is_mirror_of(const struct history *h, const struct native_mirror *mirror, const struct interest *region)
+static inline bool is_mirror_of(const struct history *h, const struct native_mirror *mirror,
+                                const struct interest *region)
 {
 	uint64_t step = native_mirror_step(mirror);
 	bool same = step <= h->step;
@@ -138,7 +139,7 @@ struct reader {
 };
 
 /* The reader may be sent this from now on. */
-static void reader_wants(struct reader *reader, struct patch_key robot)
+static inline void reader_wants(struct reader *reader, struct patch_key robot)
 {
 	struct interest region;
 
@@ -149,8 +150,8 @@ static void reader_wants(struct reader *reader, struct patch_key robot)
 	reader->region[reader->regions++] = region;
 }
 
-static void reader_join(struct reader *reader, struct publisher *p, const struct native_want *want,
-                        struct patch_key robot)
+static inline void reader_join(struct reader *reader, struct publisher *p, const struct native_want *want,
+                               struct patch_key robot)
 {
 	memset(reader, 0, sizeof(*reader));
 	reader->want = *want;
@@ -161,14 +162,14 @@ static void reader_join(struct reader *reader, struct publisher *p, const struct
 	reader_wants(reader, robot);
 }
 
-static void reader_open(struct reader *reader, struct publisher *p)
+static inline void reader_open(struct reader *reader, struct publisher *p)
 {
 	struct native_want want = {0};
 
 	reader_join(reader, p, &want, (struct patch_key){0});
 }
 
-static void reader_close(struct reader *reader)
+static inline void reader_close(struct reader *reader)
 {
 	if (reader->client)
 		publisher_leave(reader->client);
@@ -179,7 +180,7 @@ static void reader_close(struct reader *reader)
 	memset(reader, 0, sizeof(*reader));
 }
 
-static void expect_commit(struct reader *reader, const struct history *h)
+static inline void expect_commit(struct reader *reader, const struct history *h)
 {
 	while (!is_mirror_of(h, reader->mirror, &reader->region[reader->regions_at])) {
 		reader->regions_at++;
@@ -190,7 +191,7 @@ static void expect_commit(struct reader *reader, const struct history *h)
 	reader->commits++;
 }
 
-static void reader_frame(struct reader *reader, const struct history *h, const uint8_t *frame, size_t len)
+static inline void reader_frame(struct reader *reader, const struct history *h, const uint8_t *frame, size_t len)
 {
 	struct native_message message;
 	char error[128] = "";
@@ -217,7 +218,7 @@ static void reader_frame(struct reader *reader, const struct history *h, const u
 		expect_commit(reader, h);
 }
 
-static void reader_frames(struct reader *reader, const struct history *h)
+static inline void reader_frames(struct reader *reader, const struct history *h)
 {
 	size_t at = 0;
 	ssize_t n;
@@ -234,7 +235,7 @@ static void reader_frames(struct reader *reader, const struct history *h)
 }
 
 /* Writes at most `capacity` bytes, in pieces; how many there were. */
-static size_t reader_pump(struct reader *reader, const struct history *h, size_t capacity)
+static inline size_t reader_pump(struct reader *reader, const struct history *h, size_t capacity)
 {
 	size_t total = 0, n;
 	const uint8_t *bytes;
@@ -251,7 +252,7 @@ static size_t reader_pump(struct reader *reader, const struct history *h, size_t
 	return total;
 }
 
-static struct publisher *start_with(struct history *h, uint32_t side, size_t pinned_max, size_t window)
+static inline struct publisher *start_with(struct history *h, uint32_t side, size_t pinned_max, size_t window)
 {
 	struct publisher_params params = {.cell_m = CELL_M, .pinned_max = pinned_max, .window = window};
 	struct publisher *p = publisher_create(&params);
@@ -267,7 +268,7 @@ static inline struct publisher *start(struct history *h, uint32_t side, size_t p
 	return start_with(h, side, pinned_max, 0);
 }
 
-static void expect_converged(struct reader *reader, const struct history *h)
+static inline void expect_converged(struct reader *reader, const struct history *h)
 {
 	while (reader_pump(reader, h, SIZE_MAX / 2) > 0)
 		;

@@ -35,6 +35,8 @@ enum {
 	RUN_BYTES = 4 + 1 + 2,
 	KEY_BYTES = 12,
 	STEP_BYTES = 8,
+	PLANE_BYTES = 4 + 3 * 4 + 8 + 1 + 3 + 4 + 6 * 4 + 8,
+	PLANE_GONE_BYTES = 4,
 	PACKED = 1, /* the flag of a frame */
 	PACK_LEVEL = 1,
 	BATCH_MAX = 1 << 20, /* patches or removals of one batch; a BEGIN that announces more is refused */
@@ -180,6 +182,27 @@ void native_put_remove(struct buffer *b, struct patch_key key)
 {
 	put_head(b, NATIVE_REMOVE, KEY_BYTES);
 	put_key(b, key);
+}
+
+void native_put_plane(struct buffer *b, const struct native_plane *plane)
+{
+	static const uint8_t zero[3];
+
+	put_head(b, NATIVE_PLANE, PLANE_BYTES);
+	put_u32(b, plane->id);
+	buffer_append(b, plane->normal, sizeof(plane->normal));
+	buffer_append(b, &plane->distance_m, 8);
+	put_u8(b, plane->class);
+	buffer_append(b, zero, sizeof(zero));
+	buffer_append(b, &plane->area_m2, 4);
+	buffer_append(b, plane->covariance, sizeof(plane->covariance));
+	buffer_append(b, &plane->t_ns, 8);
+}
+
+void native_put_plane_gone(struct buffer *b, uint32_t id)
+{
+	put_head(b, NATIVE_PLANE_GONE, PLANE_GONE_BYTES);
+	put_u32(b, id);
 }
 
 void native_put_step(struct buffer *b, enum native_type type, uint64_t step)
@@ -489,6 +512,34 @@ static int decode_coded(const uint8_t *p, size_t len, struct native_message *ret
 	return 0;
 }
 
+static bool are_numbers(const float *value, int n)
+{
+	for (int i = 0; i < n; i++)
+		if (!(value[i] - value[i] == 0)) /* not finite */
+			return false;
+	return true;
+}
+
+static int decode_plane(const uint8_t *p, size_t len, struct native_plane *ret, char error[128])
+{
+	struct native_plane plane = {0};
+
+	if (len != PLANE_BYTES)
+		return refuse(error, "a PLANE of the wrong length");
+	plane.id = get_u32(p);
+	memcpy(plane.normal, p + 4, sizeof(plane.normal));
+	memcpy(&plane.distance_m, p + 16, 8);
+	plane.class = p[24];
+	memcpy(&plane.area_m2, p + 28, 4);
+	memcpy(plane.covariance, p + 32, sizeof(plane.covariance));
+	plane.t_ns = (int64_t)get_u64(p + 56);
+	if (!are_numbers(plane.normal, 3) || !are_numbers(&plane.area_m2, 1) || !are_numbers(plane.covariance, 6) ||
+	    !(plane.distance_m - plane.distance_m == 0))
+		return refuse(error, "a PLANE with what is no number");
+	*ret = plane;
+	return 0;
+}
+
 static int decode_payload(const uint8_t *p, size_t len, struct native_message *ret, char error[128])
 {
 	switch (ret->type) {
@@ -520,8 +571,12 @@ static int decode_payload(const uint8_t *p, size_t len, struct native_message *r
 	case NATIVE_CODED:
 		return decode_coded(p, len, ret, error);
 	case NATIVE_PLANE:
+		return decode_plane(p, len, &ret->plane, error);
 	case NATIVE_PLANE_GONE:
-		break;
+		if (len != PLANE_GONE_BYTES)
+			return refuse(error, "a PLANE_GONE of the wrong length");
+		ret->plane_gone = get_u32(p);
+		return 0;
 	}
 	snprintf(error, 128, "a message of type %d, which this version does not know", ret->type);
 	return -ENOTSUP;

@@ -60,6 +60,17 @@ struct native_begin {
 	bool reset;
 };
 
+/* A plane of the map: n . p = distance. */
+struct native_plane {
+	uint32_t id;
+	float normal[3]; /* unit length */
+	double distance_m;
+	uint8_t class;
+	float area_m2;
+	float covariance[6]; /* upper triangle */
+	int64_t t_ns;        /* of its last change */
+};
+
 /* One decoded message. Pointers in `patch` belong to the message: native_message_finish. */
 struct native_message {
 	enum native_type type;
@@ -70,6 +81,8 @@ struct native_message {
 		struct patch *patch; /* PATCH: reference 1 */
 		struct patch_key remove;
 		uint64_t step; /* COMMIT, ABORT */
+		struct native_plane plane;
+		uint32_t plane_gone;
 		struct {
 			const char *text;
 			size_t len;
@@ -89,6 +102,8 @@ void native_put_patch(struct buffer *, const struct patch *);
 void native_put_coded(struct buffer *, const uint8_t *patches, size_t len); /* as coded_put_patch made them, in a row */
 void native_put_coded_head(struct buffer *, size_t len); /* of the same: `len` bytes of patches are to follow */
 void native_put_remove(struct buffer *, struct patch_key);
+void native_put_plane(struct buffer *, const struct native_plane *);
+void native_put_plane_gone(struct buffer *, uint32_t id);
 void native_put_step(struct buffer *, enum native_type commit_or_abort, uint64_t step);
 void native_put_json(struct buffer *, const char *text, size_t len);
 void native_put_ping(struct buffer *);

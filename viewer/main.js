@@ -68,7 +68,8 @@ function hear(message) {
   } else if (message.class === 'ERROR') panel.note(message.error, true);
   else if (message.class === 'DEVICE') panel.note(`${message.name}: ${message.state}${message.message ? `: ${message.message}` : ''}`, message.state === 'backing off');
   else if (message.class === 'JUMP') panel.note(`the pose jumped by ${message.distance.toFixed(2)} m (${message.done})`, true);
-  else if (message.class === 'RECORD' && message.file) panel.note(`${message.enable === false ? 'recorded' : 'recording'} ${message.file}`);
+  else if (message.class === 'RECORD' && message.message) panel.note(message.message, message.state === 'failed');
+  else if (message.class === 'RECORD' && message.state) panel.note(`recording ${message.state}${message.file ? `: ${message.file}` : ''}`);
 }
 
 const say = (word, more) => link.send(`?${word}${more ? `=${JSON.stringify(more)}` : ''}`);
@@ -78,7 +79,7 @@ function rights() {
   $('changes').hidden = !may.change;
   $('pause').hidden = !!status.replay; // the transport has one
   $('pause').setAttribute('aria-pressed', !!status.paused);
-  $('record').setAttribute('aria-pressed', !!status.recording);
+  $('record').setAttribute('aria-pressed', !!status.record?.recording);
   $('record').hidden = !!status.replay;
 }
 
@@ -177,7 +178,7 @@ function wireUp() {
   $('save').onclick = saveMenu;
   $('formats').onclick = () => ($('formats').hidden = true);
   $('pause').onclick = () => may.change && say(status?.paused ? 'RESUME' : 'PAUSE');
-  $('record').onclick = () => say('RECORD', { enable: !status?.recording });
+  $('record').onclick = () => say('RECORD', { enable: !status?.record?.recording });
   $('pick-close').onclick = () => { $('pick').hidden = true; measure.clear(); };
   addEventListener('keydown', (event) => {
     const typing = event.target.closest?.('select, input:not([type=checkbox]), button') && event.key === ' ';

@@ -100,6 +100,9 @@ export class Panel {
     put('sweeps', whole(rows.sweeps ?? 0));
     put('dropped', whole(Object.values(rows.dropped ?? {}).reduce((sum, n) => sum + n, 0)));
     this.beamRate(rows.beams?.ok, status.t);
+    const { record } = status;
+    put('recorded', record?.recording ? size(record.bytes) : record?.error ? 'failed' : 'off');
+    $('recorded').title = record?.error ?? record?.file ?? '';
     put('version', `facetd ${status.version ?? ''}`);
     this.devices(status.devices ?? []);
   }

@@ -81,7 +81,8 @@ export class MapScene {
   // Once a frame that took `dt` s. `whole`: the mirror stands at a commit, so what is dirty fits together. True when
   // something changed. Where frames are slow anyway the budget is a fifth of them.
   update(whole, eye, dt) {
-    const budgetMs = dt === Infinity ? dt : Math.max(this.whole ? BUDGET_MS : FIRST_MS, Math.min(200 * dt, 50));
+    const budgetMs = dt === Infinity ? dt
+      : this.whole ? Math.max(BUDGET_MS, Math.min(200 * dt, 50)) : Math.max(FIRST_MS, Math.min(500 * dt, 400));
     if (!this.stage && this.dirty.size && (whole || !this.whole)) this.begin(eye);
     if (!this.stage) return false;
     const { stage } = this, begun = performance.now();

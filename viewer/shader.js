@@ -30,7 +30,7 @@ const fragmentShader = `
 precision highp float;
 uniform int mode;
 uniform bool wire, edges, backs;
-uniform float section, now, ageSpan;
+uniform float section, now, ageSpan, veilFrom;
 uniform vec2 heights;
 uniform vec3 eye, classes[9], ramp[5];
 in vec3 at;
@@ -74,7 +74,8 @@ void main() {
   vec3 flatNormal = normalize(cross(dFdx(at), dFdy(at)));
   if (!gl_FrontFacing && !backs) { // walls seen from behind are a veil, floors and ceilings nothing: a doll's house
     ivec2 p = ivec2(gl_FragCoord.xy);
-    if (abs(flatNormal.z) > 0.6 || (p.x & 1) != 0 || ((p.y + (p.x >> 1)) & 1) != 0) discard;
+    if (abs(flatNormal.z) > 0.6 || length(eye - at) < veilFrom) discard; // near, a veil would be in the way
+    if ((p.x & 1) != 0 || ((p.y + (p.x >> 1)) & 1) != 0) discard;
   }
   vec3 toEye = normalize(eye - at);
   vec3 n = mode == 1 && dot(smoothNormal, smoothNormal) > 0.01 ? normalize(smoothNormal) : flatNormal;
@@ -100,7 +101,7 @@ export function mapMaterial() {
     glslVersion: GLSL3, vertexShader, fragmentShader, side: DoubleSide,
     uniforms: {
       mode: { value: 0 }, wire: { value: false }, edges: { value: true }, backs: { value: false }, section: { value: 1e9 }, now: { value: 0 },
-      ageSpan: { value: 60 }, heights: { value: new Vector2(0, 3) }, eye: { value: new Vector3() },
+      ageSpan: { value: 60 }, veilFrom: { value: 9 }, heights: { value: new Vector2(0, 3) }, eye: { value: new Vector3() },
       classes: { value: vectors(CLASS_COLOURS) }, ramp: { value: vectors(RAMP) },
     },
   });

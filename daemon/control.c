@@ -5,17 +5,17 @@
 
 #include <errno.h>
 #include <jansson.h>
+#include <math.h>
 #include <stdio.h>
 #include <stdlib.h>
 #include <string.h>
 
-static const char *const words[] = {"STATUS", "WATCH", "PAUSE", "RESUME", "RESET", "SAVE", "RECORD"};
+static const char *const words[] = {"STATUS", "WATCH", "PAUSE", "RESUME", "RESET", "SAVE", "RECORD", "SEEK"};
 
 static const struct {
 	const char *word, *sentence;
 } later[] = {
     {"SWEEP", "?SWEEP comes in a later version: set `sweep` in the configuration"},
-    {"SEEK", "?SEEK comes in a later version"},
 };
 
 const char *control_name(enum control_word word)
@@ -26,12 +26,12 @@ const char *control_name(enum control_word word)
 bool control_changes(enum control_word word)
 {
 	return word == CONTROL_PAUSE || word == CONTROL_RESUME || word == CONTROL_RESET || word == CONTROL_SAVE ||
-	       word == CONTROL_RECORD;
+	       word == CONTROL_RECORD || word == CONTROL_SEEK;
 }
 
 bool control_plays(enum control_word word)
 {
-	return word == CONTROL_PAUSE || word == CONTROL_RESUME;
+	return word == CONTROL_PAUSE || word == CONTROL_RESUME || word == CONTROL_SEEK;
 }
 
 static int refuse(char error[200], const char *sentence)
@@ -52,8 +52,9 @@ static int find_word(const char *word, enum control_word *ret, char error[200])
 			snprintf(error, 200, "%s", later[i].sentence);
 			return -ENOTSUP;
 		}
-	return refuse(error, "not a command: say ?STATUS, ?WATCH={\"enable\":true}, ?PAUSE, ?RESUME, ?RESET or "
-	                     "?SAVE={\"file\":\"NAME.ply\"} or ?RECORD={\"enable\":true}");
+	return refuse(error,
+	              "not a command: say ?STATUS, ?WATCH={\"enable\":true}, ?PAUSE, ?RESUME, ?RESET, ?SEEK={...}, "
+	              "?SAVE={\"file\":\"NAME.ply\"} or ?RECORD={\"enable\":true}");
 }
 
 static int read_file(json_t *arguments, struct control_command *command, char error[200])
@@ -63,6 +64,26 @@ static int read_file(json_t *arguments, struct control_command *command, char er
 	if (!file || strlen(file) >= sizeof(command->file))
 		return refuse(error, "?SAVE={\"file\":\"NAME.ply\"}: a name is needed, of less than 128 bytes");
 	snprintf(command->file, sizeof(command->file), "%s", file);
+	return 0;
+}
+
+/* {"t": seconds}, {"speed": number or "max"}, or both. */
+static int read_seek(json_t *arguments, struct control_command *command, char error[200])
+{
+	json_t *t = json_object_get(arguments, "t"), *speed = json_object_get(arguments, "speed");
+	const bool max = json_is_string(speed) && strcmp(json_string_value(speed), "max") == 0;
+
+	if (!t && !speed)
+		return refuse(error,
+		              "say where to, or how fast: ?SEEK={\"t\": SECONDS} or ?SEEK={\"speed\": X or \"max\"}");
+	if (t && (!json_is_number(t) || !(fabs(json_number_value(t)) < 4e9)))
+		return refuse(error, "`t` is recorded time in seconds, as STATUS tells it in `replay`");
+	if (speed && !max && !(json_is_number(speed) && json_number_value(speed) > 0))
+		return refuse(error, "`speed` is a number above 0, or \"max\"");
+	command->seek = t != NULL;
+	command->seek_ns = (int64_t)(json_number_value(t) * 1e9);
+	command->pace = speed != NULL;
+	command->speed = max ? 0 : json_number_value(speed);
 	return 0;
 }
 
@@ -80,6 +101,8 @@ static int read_arguments(json_t *arguments, struct control_command *command, ch
 	if (stream && !json_is_boolean(stream))
 		return refuse(error, "`stream` is true or false");
 	command->stream = command->word == CONTROL_RECORD && json_is_true(stream);
+	if (command->word == CONTROL_SEEK)
+		return read_seek(arguments, command, error);
 	return command->word == CONTROL_SAVE ? read_file(arguments, command, error) : 0;
 }
 
@@ -393,6 +416,16 @@ static json_t *clients_json(const struct control_status *s)
 	return list;
 }
 
+static json_t *replay_json(const struct control_status *s)
+{
+	const struct player_status *p = &s->replay;
+
+	return json_pack("{s:s, s:f, s:f, s:f, s:o, s:I, s:o, s:o}", "state", player_state_name(p->state), "position",
+	                 (double)p->now_ns / 1e9, "begin", (double)p->begin_ns / 1e9, "end", (double)p->end_ns / 1e9,
+	                 "speed", p->speed == 0 ? json_string("max") : json_real(p->speed), "seeks",
+	                 (json_int_t)p->seeks, "error", text_json(s->replay_error), "note", text_json(s->replay_note));
+}
+
 void control_put_status(struct buffer *b, const struct control_status *s)
 {
 	char map_id[33];
@@ -421,6 +454,8 @@ void control_put_status(struct buffer *b, const struct control_status *s)
 	json_object_set_new(json, "latency_ms",
 	                    json_pack("{s:f, s:f, s:I}", "p50", s->latency_p50_ms, "p99", s->latency_p99_ms, "n",
 	                              (json_int_t)s->latencies));
+	if (s->replays)
+		json_object_set_new(json, "replay", replay_json(s));
 	json_object_set_new(json, "devices", devices_json(s));
 	json_object_set_new(json, "record", record_json(s));
 	json_object_set_new(json, "clients", clients_json(s));

@@ -5,6 +5,7 @@
 #include "core/model.h"
 #include "core/native.h"
 #include "core/pose_track.h"
+#include "daemon/player.h"
 #include "daemon/recorder.h"
 #include "daemon/supervisor.h"
 #include "daemon/worker.h"
@@ -19,7 +20,8 @@ enum control_word {
 	CONTROL_RESUME,
 	CONTROL_RESET,
 	CONTROL_SAVE,
-	CONTROL_RECORD
+	CONTROL_RECORD,
+	CONTROL_SEEK
 };
 
 struct control_command {
@@ -27,6 +29,10 @@ struct control_command {
 	bool enable;                 /* of WATCH, RECORD */
 	bool stream;                 /* of RECORD: to this client */
 	char file[CONTROL_FILE_MAX]; /* of SAVE; longer ones are refused */
+	/* of SEEK */
+	bool seek, pace;
+	int64_t seek_ns;
+	double speed; /* 0: max */
 };
 
 /* Parses `?WORD`, `?WORD={...}` or `{"command": "WORD", ...}`, with or without a `;` at the end. 0, -ENOTSUP where the
@@ -81,6 +87,9 @@ struct control_status {
 	size_t streams; /* recordings that clients take */
 	size_t clients;
 	const struct control_client *client;
+	bool replays; /* and how: */
+	struct player_status replay;
+	const char *replay_error, *replay_note; /* may be empty */
 };
 
 /* Each appends one JSON text without a newline. */

@@ -31,8 +31,10 @@
 #include "daemon/live.h"
 #include "daemon/log.h"
 #include "daemon/notify.h"
+#include "daemon/player.h"
 #include "daemon/publisher.h"
 #include "daemon/recorders.h"
+#include "daemon/replay_lines.h"
 #include "daemon/server.h"
 #include "daemon/snapshot.h"
 #include "daemon/supervisor.h"
@@ -67,6 +69,9 @@ struct daemon {
 	struct worker *worker;
 	struct pipeline *pipeline;
 	struct supervisor *supervisor;
+	struct replay *replay; /* NULL: live. Instead of devices, ticks and supervisor: */
+	struct player *player;
+	struct replay_lines lines;
 	struct server *server;
 	struct web *web; /* NULL: there is none */
 	struct live *live;
@@ -142,6 +147,7 @@ static void tell_clients(struct daemon *d, struct buffer *message)
 /* Devices */
 
 static void set_device_timer(struct daemon *d);
+static void on_devices(uv_timer_t *timer);
 
 static void on_device(uv_poll_t *poll, int status, int events)
 {
@@ -258,10 +264,28 @@ static void log_device(void *ctx, int device, int priority, const char *text)
 	tell_clients(d, &message);
 }
 
+/* Plays what is due; in a replay the devices' timer is the player's. */
+static void play(struct daemon *d)
+{
+	const int64_t t_ns = wall_clock_read(CLOCK_MONOTONIC);
+	int64_t next_ns;
+
+	if (d->closed || d->stopping)
+		return;
+	next_ns = player_turn(d->player, t_ns);
+	if (d->closed || next_ns == INT64_MAX)
+		return;
+	uv_timer_start(&d->devices, on_devices, next_ns <= t_ns ? 0 : (uint64_t)(next_ns - t_ns + 999999) / 1000000, 0);
+}
+
 static void on_devices(uv_timer_t *timer)
 {
 	struct daemon *d = timer->data;
 
+	if (d->replay) {
+		play(d);
+		return;
+	}
 	supervisor_timer(d->supervisor, now(d));
 	set_device_timer(d);
 }
@@ -269,6 +293,11 @@ static void on_devices(uv_timer_t *timer)
 /* One timer for the nearest deadline of all devices. */
 static void set_device_timer(struct daemon *d)
 {
+	if (d->replay) {
+		if (d->stopping)
+			close_all(d);
+		return;
+	}
 	int64_t deadline_ns = supervisor_deadline(d->supervisor), wait_ns = deadline_ns - now(d);
 
 	if (d->closed)
@@ -286,8 +315,9 @@ static void set_device_timer(struct daemon *d)
 static bool take_row(void *ctx, struct row *row)
 {
 	struct daemon *d = ctx;
+	const int64_t arrival_ns = d->replay ? now(d) : pipeline_arrival_ns(d->pipeline);
 	struct vec3 at = row->n > 0 ? row->beam[0].origin : (struct vec3){0};
-	bool taken = !d->paused && worker_row(d->worker, row, pipeline_arrival_ns(d->pipeline));
+	bool taken = !d->paused && worker_row(d->worker, row, arrival_ns);
 
 	d->rows_paused += d->paused;
 	d->queue_full += !d->paused && !taken;
@@ -314,12 +344,20 @@ static void on_flush(void *ctx)
 
 static void on_reply(void *ctx, int device, const struct reply *reply)
 {
-	supervisor_reply(((struct daemon *)ctx)->supervisor, device, reply);
+	struct daemon *d = ctx;
+
+	if (!d->replay)
+		supervisor_reply(d->supervisor, device, reply);
 }
 
 static void on_data(void *ctx, int device, int64_t t_ns)
 {
-	supervisor_data(((struct daemon *)ctx)->supervisor, device, t_ns);
+	struct daemon *d = ctx;
+
+	if (d->replay)
+		replay_lines_data(&d->lines, device, t_ns);
+	else
+		supervisor_data(d->supervisor, device, t_ns);
 }
 
 static void on_profile(void *ctx, int device, const struct profile *profile)
@@ -381,10 +419,99 @@ static void on_jump(void *ctx, int device, const struct pose_jump *jump)
 	if (jump->done != POSE_TRACK_NEW_MAP)
 		return;
 	pipeline_reset(d->pipeline);
+	if (d->replay) { /* what was saved live is not saved again */
+		worker_reset(d->worker);
+		replay_began(d->replay);
+		return;
+	}
 	worker_end(d->worker);
 	make_map_id(d, d->list_map_id);
 	d->list_ahead = true;
 	begin_list(d);
+}
+
+/* The player's host */
+
+static bool has_room(void *ctx)
+{
+	return worker_room(((struct daemon *)ctx)->worker);
+}
+
+static int on_replayed(void *ctx, const struct replay_event *event, char error[REPLAY_ERROR_MAX])
+{
+	struct daemon *d = ctx;
+	bool anew;
+	int r;
+
+	replay_lines_event(&d->lines, d->config, event);
+	r = replay_feed(d->replay, event, d->pipeline, &anew, error);
+	if (r == 0 && anew)
+		worker_reset(d->worker);
+	if (event->kind == REPLAY_ROW)
+		take_row(d, event->row);
+	if (event->kind == REPLAY_EVENT) {
+		struct buffer message = {0};
+
+		buffer_append(&message, event->bytes, event->len);
+		tell_clients(d, &message);
+	}
+	return r;
+}
+
+static void on_rushing(void *ctx, bool on)
+{
+	worker_hold(((struct daemon *)ctx)->worker, on);
+}
+
+static void on_again(void *ctx)
+{
+	struct daemon *d = ctx;
+
+	replay_lines_reset(&d->lines);
+	worker_reset(d->worker);
+}
+
+static void on_ended(void *ctx)
+{
+	struct daemon *d = ctx;
+
+	if (replay_ends(d->replay)) {
+		pipeline_end(d->pipeline);
+		worker_flush(d->worker);
+	}
+	if (*player_error(d->player))
+		log_line(LOG_ERR, "%s: the replay ends there", player_error(d->player));
+	else
+		log_line(LOG_INFO, "the recording was replayed to its end%s%s", *replay_note(d->replay) ? ": " : "",
+		         replay_note(d->replay));
+}
+
+static bool seek(struct daemon *d, const struct control_command *command, int64_t t_ns, char error[200])
+{
+	if (command->pace && !player_speed(d->player, command->speed, t_ns, error))
+		return false;
+	return !command->seek || player_seek(d->player, command->seek_ns, t_ns, error);
+}
+
+static bool do_playback(struct daemon *d, const struct control_command *command, char error[200])
+{
+	const int64_t t_ns = wall_clock_read(CLOCK_MONOTONIC);
+	struct player_status status;
+	bool done = true;
+
+	if (!d->player) {
+		snprintf(error, 200, "nothing is replayed: run facetd --replay FILE");
+		return false;
+	}
+	player_status(d->player, t_ns, &status);
+	if (command->word == CONTROL_SEEK)
+		done = seek(d, command, t_ns, error);
+	else if (command->word == CONTROL_RESET)
+		done = player_seek(d->player, status.begin_ns, t_ns, error);
+	else
+		player_play(d->player, command->word == CONTROL_RESUME, t_ns);
+	uv_timer_start(&d->devices, on_devices, 0, 0);
+	return done;
 }
 
 static void on_tick(uv_timer_t *timer)
@@ -499,6 +626,8 @@ static void on_results(uv_async_t *async)
 		note_latencies(d, result);
 		worker_result_destroy(result);
 	}
+	if (d->player && r == 0)
+		play(d); /* there may be room again */
 	if (r < 0 || status.failed)
 		fail(d, -ENOMEM, "out of memory; give the machine more, or set a smaller map.memory");
 }
@@ -531,6 +660,11 @@ static double rate(uint64_t newest, uint64_t oldest, uint64_t seconds)
 	return seconds > 0 ? (double)(newest - oldest) / (double)seconds : 0;
 }
 
+static const struct supervisor_device *device_line(const struct daemon *d, int device)
+{
+	return d->replay ? &d->lines.line[device] : supervisor_device(d->supervisor, device);
+}
+
 static void fill_devices(const struct daemon *d, struct control_status *s)
 {
 	uint64_t span = d->seconds < RATE_SECONDS ? d->seconds : RATE_SECONDS;
@@ -540,7 +674,7 @@ static void fill_devices(const struct daemon *d, struct control_status *s)
 	for (int i = 0; i < s->devices; i++) {
 		s->device[i].name = d->config->device[i].name;
 		s->device[i].driver = d->config->device[i].driver;
-		s->device[i].line = *supervisor_device(d->supervisor, i);
+		s->device[i].line = *device_line(d, i);
 		s->device[i].rate = rate(d->decoded[last][i], d->decoded[first][i], span);
 		s->device[i].fixed = d->config->device[i].fixed;
 		pipeline_counters(d->pipeline, i, &s->device[i].counters);
@@ -548,6 +682,19 @@ static void fill_devices(const struct daemon *d, struct control_status *s)
 		pipeline_track(d->pipeline, i, &s->device[i].track);
 	}
 	s->rows.rate = rate(d->rows[last], d->rows[first], span);
+}
+
+/* The time is that of the recording. */
+static void fill_replay(const struct daemon *d, struct control_status *s)
+{
+	s->replays = true;
+	player_status(d->player, wall_clock_read(CLOCK_MONOTONIC), &s->replay);
+	if (!s->worker.idle && (s->replay.state == PLAYER_PAUSED || s->replay.state == PLAYER_ENDED))
+		s->replay.state = PLAYER_SEEKING; /* the map is not there yet */
+	s->t_ns = s->replay.now_ns;
+	s->paused = s->replay.state == PLAYER_PAUSED;
+	s->replay_error = player_error(d->player);
+	s->replay_note = replay_note(d->replay);
 }
 
 static size_t resident_bytes(void)
@@ -587,6 +734,8 @@ static void fill_status(struct daemon *d, struct control_client client[CLIENTS_S
 	s.uptime_ns = s.t_ns - d->started_ns;
 	s.step = map.step;
 	s.paused = d->paused;
+	if (d->player)
+		fill_replay(d, &s);
 	s.rows.assembled = rows.rows;
 	s.rows.applied = d->field.step;
 	s.rows.not_applied = rows.not_applied;
@@ -679,10 +828,19 @@ static void on_streams(void *ctx)
 		server_streams(d->server);
 }
 
+static bool may_record(const struct daemon *d, char error[200])
+{
+	if (d->replay)
+		snprintf(error, 200, "a recording is being replayed: copy its file, there is nothing else to record");
+	return !d->replay;
+}
+
 static struct recorder *begin_stream(void *ctx, char error[200])
 {
 	struct daemon *d = ctx;
 
+	if (!may_record(d, error))
+		return NULL;
 	log_line(LOG_INFO, "a client records");
 	return recorders_stream(d->recorders, error);
 }
@@ -720,9 +878,11 @@ static bool do_command(void *ctx, const struct control_command *command, char er
 	log_line(LOG_INFO, "a client asks for %s", control_name(command->word));
 	note_command(d, command->word);
 	if (command->word == CONTROL_RECORD)
-		return recorders_enable(d->recorders, command->enable, error);
+		return may_record(d, error) && recorders_enable(d->recorders, command->enable, error);
 	if (command->word == CONTROL_SAVE)
 		return save(d, command->file, error);
+	if (d->player || command->word == CONTROL_SEEK)
+		return do_playback(d, command, error);
 	if (command->word == CONTROL_RESET) {
 		pipeline_reset(d->pipeline);
 		worker_reset(d->worker);
@@ -764,6 +924,16 @@ static void log_limits(struct daemon *d)
 	d->memory_full = full;
 }
 
+/* Who plays as fast as can be shows a map once a second; who seeks, none. */
+static void show_rush(struct daemon *d)
+{
+	struct player_status status;
+
+	player_status(d->player, wall_clock_read(CLOCK_MONOTONIC), &status);
+	if (status.state == PLAYER_PLAYING && status.speed == 0)
+		worker_mesh(d->worker);
+}
+
 static void on_second(uv_timer_t *timer)
 {
 	struct daemon *d = timer->data;
@@ -772,9 +942,11 @@ static void on_second(uv_timer_t *timer)
 
 	pipeline_stats(d->pipeline, &rows);
 	d->rows[column] = rows.rows;
+	if (d->player)
+		show_rush(d);
 	log_limits(d);
 	for (int i = 0; i < d->config->devices; i++)
-		d->decoded[column][i] = supervisor_device(d->supervisor, i)->decoded;
+		d->decoded[column][i] = device_line(d, i)->decoded;
 	if (d->journal && !d->journal_failed && journal_error(d->journal) < 0) {
 		d->journal_failed = true;
 		log_line(LOG_ERR, "the journal can no longer be written (%s); it ends here",
@@ -815,7 +987,8 @@ static void stop(struct daemon *d)
 	d->stopping = true;
 	notify_stopping();
 	uv_timer_start(&d->last, on_last, (uint64_t)supervisor_stop_ns(d->config) / 1000000 + LAST_MS, 0);
-	supervisor_stop(d->supervisor, now(d));
+	if (!d->replay)
+		supervisor_stop(d->supervisor, now(d));
 	set_device_timer(d);
 }
 
@@ -858,7 +1031,8 @@ static void begin_handles(struct daemon *d)
 	d->interrupt.data = d->terminate.data = d;
 	uv_signal_start(&d->interrupt, on_signal, SIGINT);
 	uv_signal_start(&d->terminate, on_signal, SIGTERM);
-	uv_timer_start(&d->tick, on_tick, TICK_MS, TICK_MS);
+	if (!d->replay)
+		uv_timer_start(&d->tick, on_tick, TICK_MS, TICK_MS);
 	uv_timer_start(&d->second, on_second, 1000, 1000);
 	if (watchdog_ms > 0)
 		uv_timer_start(&d->watchdog, on_watchdog, watchdog_ms, watchdog_ms);
@@ -871,8 +1045,45 @@ static void on_log(void *ctx, int priority, const char *text)
 	live_log(d->live, now(d), priority, text);
 }
 
-static bool begin_parts(struct daemon *d, const char *config_text)
+/* Log time; in a replay the recorded one. */
+static int64_t data_time(void *ctx)
 {
+	const struct daemon *d = ctx;
+	struct player_status status;
+
+	if (!d->player)
+		return now(ctx);
+	player_status(d->player, wall_clock_read(CLOCK_MONOTONIC), &status);
+	return status.now_ns;
+}
+
+static void put_playback(void *ctx, struct player_status *ret)
+{
+	const struct daemon *d = ctx;
+
+	player_status(d->player, wall_clock_read(CLOCK_MONOTONIC), ret);
+}
+
+static bool do_request(void *ctx, const struct foxglove_request *request, char error[200])
+{
+	struct daemon *d = ctx;
+	const int64_t t_ns = wall_clock_read(CLOCK_MONOTONIC);
+	struct player_status status;
+	bool done = true;
+
+	player_status(d->player, t_ns, &status);
+	if (request->speed > 0 && request->speed != status.speed)
+		done = player_speed(d->player, request->speed, t_ns, error);
+	player_play(d->player, request->play, t_ns);
+	if (request->seek)
+		done = player_seek(d->player, request->seek_ns, t_ns, error) && done;
+	uv_timer_start(&d->devices, on_devices, 0, 0);
+	return done;
+}
+
+static bool begin_parts(struct daemon *d, const struct daemon_options *options)
+{
+	const struct player_host player = {d, has_room, on_replayed, on_rushing, on_again, on_ended};
 	const struct config *config = d->config;
 	struct publisher_params publisher = {.cell_m = config->map.cell_m};
 	struct worker_params worker = {.map = {.cell_m = config->map.cell_m,
@@ -880,6 +1091,7 @@ static bool begin_parts(struct daemon *d, const char *config_text)
 	                                       .reduce = config->map.reduce,
 	                                       .lookahead = config->map.lookahead,
 	                                       .memory = config->map.memory},
+	                               .patient = d->replay != NULL,
 	                               .ready = on_worker_ready,
 	                               .ctx = &d->results};
 	struct pipeline_sink sink = {.ctx = d,
@@ -892,12 +1104,16 @@ static bool begin_parts(struct daemon *d, const char *config_text)
 	                             .profile = on_profile,
 	                             .tilt = on_tilt,
 	                             .pose = on_pose};
-	struct foxglove_host foxglove = {.ctx = d, .now = now, .time = now, .status = put_status};
+	struct foxglove_host foxglove = {.ctx = d, .now = now, .time = data_time, .status = put_status};
 	struct supervisor_host host = {d, watch_device, on_record, log_device};
 
 	memcpy(publisher.map_id, d->map_id, sizeof(publisher.map_id));
 	for (int i = 0; i < config->devices; i++)
 		d->driver[i] = driver_find(config->device[i].driver);
+	if (d->replay) {
+		foxglove.playback = put_playback;
+		foxglove.play = do_request;
+	}
 	foxglove_encoders(&publisher, &config->map.cell_m);
 	d->publisher = publisher_create(&publisher);
 	d->live = live_create(config);
@@ -909,15 +1125,17 @@ static bool begin_parts(struct daemon *d, const char *config_text)
 	d->supervisor = supervisor_create(config, d->driver, &host);
 	d->archive = archive_create(&d->loop, config->map.archive, config->map.cell_m, on_saved, d);
 	d->snapshots = snapshots_create(&d->loop, d->publisher, config->map.archive, on_snapshot_saved, d);
+	if (d->replay)
+		d->player = player_create(d->replay, &player, options->speed);
 	return d->foxglove && d->worker && d->pipeline && d->supervisor && d->archive && d->snapshots &&
-	       begin_recorders(d, config_text);
+	       (d->player || !d->replay) && begin_recorders(d, options->config_text);
 }
 
 /* A web that the configuration names must be possible. The default one need not: a second daemon on this machine, or a build
  * without it, maps all the same. */
 static int begin_web(struct daemon *d, const struct server_host *server)
 {
-	const struct web_host host = {*server, put_metrics, d->snapshots, false};
+	const struct web_host host = {*server, put_metrics, d->snapshots, d->replay != NULL};
 	int r;
 
 	d->web = web_create(&d->loop, d->config, d->publisher, &host, &r, d->error);
@@ -934,7 +1152,8 @@ static int begin_web(struct daemon *d, const struct server_host *server)
 
 static int begin(struct daemon *d, const struct daemon_options *options)
 {
-	struct server_host host = {d, now, put_status, do_command, log_server, begin_stream, end_stream};
+	struct server_host host = {d,          now,          put_status, do_command,
+	                           log_server, begin_stream, end_stream, d->replay != NULL};
 
 	if (options->journal) {
 		d->journal = journal_create(options->journal, d->error);
@@ -942,7 +1161,7 @@ static int begin(struct daemon *d, const struct daemon_options *options)
 			return -EIO;
 		journal_sink(d->journal, &d->keep);
 	}
-	if (!begin_parts(d, options->config_text)) {
+	if (!begin_parts(d, options)) {
 		snprintf(d->error, 320, "out of memory; give the machine more, or set a smaller map.memory");
 		return -ENOMEM;
 	}
@@ -957,6 +1176,7 @@ static void finish(struct daemon *d)
 {
 	supervisor_destroy(d->supervisor);
 	server_destroy(d->server);
+	player_destroy(d->player);
 	pipeline_destroy(d->pipeline);
 	archive_stop(d->archive);
 	journal_destroy(d->journal);
@@ -986,6 +1206,7 @@ int daemon_run(const struct config *config, const struct daemon_options *options
 	signal(SIGPIPE, SIG_IGN);
 	d->config = config;
 	d->error = error;
+	d->replay = options->replay;
 	d->wall_offset_ns = d->clock_offset_ns = wall_clock_first_offset();
 	d->started_ns = now(d);
 	make_map_id(d, d->map_id);
@@ -993,8 +1214,12 @@ int daemon_run(const struct config *config, const struct daemon_options *options
 	begin_handles(d);
 	r = begin(d, options);
 	if (r == 0) {
-		supervisor_start(d->supervisor, now(d));
-		set_device_timer(d);
+		if (d->replay) {
+			uv_timer_start(&d->devices, on_devices, 0, 0);
+		} else {
+			supervisor_start(d->supervisor, now(d));
+			set_device_timer(d);
+		}
 		announce(d);
 		uv_run(&d->loop, UV_RUN_DEFAULT);
 		r = d->failure;

@@ -25,8 +25,8 @@ struct player_host {
 	bool (*room)(void *ctx);
 	/* Handles one event. 0 or -errno with a sentence: the replay ends there. */
 	int (*event)(void *ctx, const struct replay_event *, char error[REPLAY_ERROR_MAX]);
-	/* While it seeks nothing need be meshed or told; `on` false: the place is reached. */
-	void (*seeking)(void *ctx, bool on);
+	/* While it seeks, and while it plays as fast as can be, nothing need be meshed or told; `on` false: the place is reached. */
+	void (*rushing)(void *ctx, bool on);
 	/* The map is void: the recording is gone through again from a beginning, as a new generation. */
 	void (*again)(void *ctx);
 	/* The end of the recording: what waits is handed out. */
@@ -38,7 +38,7 @@ struct player;
 struct player *player_create(struct replay *, const struct player_host *, double speed);
 void player_destroy(struct player *);
 
-/* Hands over what is due at `mono_ns`, for at most PLAYER_SLICE_NS by the count of events; the time at which to call again (INT64_MAX:
+/* Hands over what is due at `mono_ns`, at most PLAYER_EVENTS_MAX events; the time at which to call again (INT64_MAX:
  * when there is room, or when somebody plays or seeks). */
 #define PLAYER_EVENTS_MAX 256 /* in one turn */
 int64_t player_turn(struct player *, int64_t mono_ns);

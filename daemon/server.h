@@ -26,6 +26,7 @@ struct server_host {
 	/* A recording whose bytes the client takes; NULL with a sentence. It ends with the connection, or before. */
 	struct recorder *(*stream)(void *ctx, char error[200]);
 	void (*stream_end)(void *ctx, struct recorder *);
+	bool replays; /* playback may be commanded by everybody who gets in */
 };
 
 struct server;

@@ -18,7 +18,7 @@
 
 #include "daemon/crew.h"
 
-enum item_kind { ITEM_ROW, ITEM_FLUSH, ITEM_RESET, ITEM_END };
+enum item_kind { ITEM_ROW, ITEM_MESH, ITEM_FLUSH, ITEM_RESET, ITEM_END };
 
 struct item {
 	enum item_kind kind;
@@ -26,8 +26,9 @@ struct item {
 	int64_t arrival_ns;
 };
 
-/* Between two rows stand at most a flush, a reset and an end: see push_control. */
-#define ITEMS_MAX (4 * (WORKER_ROWS_MAX + 1))
+/* Between two rows stand at most a wish for meshes, a flush, a reset and an end: see push_control. A patient worker's queue
+ * grows by what one record completes. */
+#define ITEMS_MAX (5 * (WORKER_ROWS_MAX + 1))
 
 struct worker {
 	struct worker_params params;
@@ -35,12 +36,13 @@ struct worker {
 	pthread_mutex_t lock;
 	pthread_cond_t wake; /* the worker waits: for an item, or for room among the results */
 	atomic_uint_fast64_t progress;
+	atomic_bool hold;
 	atomic_bool stop;       /* set under `lock`, read without it between patches */
 	uint64_t progress_seen; /* the loop's */
 
 	/* Under `lock`. */
-	struct item item[ITEMS_MAX]; /* ring */
-	size_t first, items;
+	struct item *item; /* ring */
+	size_t first, items, cap;
 	struct worker_result *oldest, **newest;
 	size_t results;
 	bool idle;
@@ -64,6 +66,8 @@ static void progress(struct worker *w)
 /* False: stop. Sets *ret_more when another item waits already. */
 static bool next_item(struct worker *w, struct item *ret, bool *ret_more)
 {
+	bool room;
+
 	pthread_mutex_lock(&w->lock);
 	while (!w->stop && w->items == 0) {
 		w->idle = true;
@@ -75,14 +79,17 @@ static bool next_item(struct worker *w, struct item *ret, bool *ret_more)
 		return false;
 	}
 	*ret = w->item[w->first];
-	w->first = (w->first + 1) % ITEMS_MAX;
+	w->first = (w->first + 1) % w->cap;
 	w->items--;
 	if (ret->kind == ITEM_ROW) {
 		w->status.queued--;
 		w->status.rows++;
 	}
 	*ret_more = w->items > 0;
+	room = w->params.patient && ret->kind == ITEM_ROW && w->status.queued == WORKER_ROWS_MAX / 2;
 	pthread_mutex_unlock(&w->lock);
+	if (room)
+		w->params.ready(w->params.ctx);
 	return true;
 }
 
@@ -110,9 +117,11 @@ static bool apply(struct worker *w, const struct item *item)
 	switch (item->kind) {
 	case ITEM_ROW:
 		w->rows_since_mesh++;
-		if (map_row(w->map, item->row) > 0)
+		if (map_row(w->map, item->row) > 0 && w->result->arrivals < WORKER_MESH_ROWS)
 			w->result->arrival_ns[w->result->arrivals++] = item->arrival_ns;
 		return true;
+	case ITEM_MESH:
+		return publish(w);
 	case ITEM_FLUSH:
 		map_flush(w->map);
 		return true;
@@ -195,7 +204,7 @@ static void *run(void *ctx)
 	while (good && next_item(w, &item, &more)) {
 		good = apply(w, &item);
 		progress(w);
-		if (good && (!more || w->rows_since_mesh == WORKER_MESH_ROWS))
+		if (good && !w->hold && (!more || w->rows_since_mesh >= WORKER_MESH_ROWS))
 			good = publish(w);
 	}
 	if (!good) {
@@ -219,11 +228,14 @@ static struct worker *worker_allocate(const struct worker_params *params)
 	w->newest = &w->oldest;
 	w->crew = crew_create(params->threads);
 	w->result = calloc(1, sizeof(*w->result));
-	if (w->crew && w->result && begin_map(w))
+	w->item = calloc(ITEMS_MAX, sizeof(*w->item));
+	w->cap = ITEMS_MAX;
+	if (w->crew && w->result && w->item && begin_map(w))
 		return w;
 	map_destroy(w->map);
 	crew_destroy(w->crew);
 	free(w->result);
+	free(w->item);
 	free(w);
 	return NULL;
 }
@@ -232,7 +244,7 @@ static void worker_free(struct worker *w)
 {
 	struct worker_result *result;
 
-	for (; w->items > 0; w->items--, w->first = (w->first + 1) % ITEMS_MAX)
+	for (; w->items > 0; w->items--, w->first = (w->first + 1) % w->cap)
 		if (w->item[w->first].kind == ITEM_ROW)
 			row_destroy(w->item[w->first].row);
 	while ((result = w->oldest) != NULL) {
@@ -244,6 +256,7 @@ static void worker_free(struct worker *w)
 	crew_destroy(w->crew);
 	pthread_cond_destroy(&w->wake);
 	pthread_mutex_destroy(&w->lock);
+	free(w->item);
 	free(w);
 }
 
@@ -276,11 +289,31 @@ void worker_destroy(struct worker *w)
 	worker_free(w);
 }
 
-static void push(struct worker *w, struct item item)
+/* Patient: twice the room. False when memory is out. */
+static bool grow(struct worker *w)
 {
-	assert(w->items < ITEMS_MAX);
-	w->item[(w->first + w->items++) % ITEMS_MAX] = item;
+	struct item *grown = calloc(2 * w->cap, sizeof(*grown));
+
+	if (!grown)
+		return false;
+	for (size_t i = 0; i < w->items; i++)
+		grown[i] = w->item[(w->first + i) % w->cap];
+	free(w->item);
+	w->item = grown;
+	w->first = 0;
+	w->cap *= 2;
+	return true;
+}
+
+static bool push(struct worker *w, struct item item)
+{
+	if (w->items == w->cap && !grow(w)) {
+		w->status.failed = true;
+		return false;
+	}
+	w->item[(w->first + w->items++) % w->cap] = item;
 	pthread_cond_signal(&w->wake);
+	return true;
 }
 
 bool worker_row(struct worker *w, struct row *row, int64_t arrival_ns)
@@ -288,9 +321,9 @@ bool worker_row(struct worker *w, struct row *row, int64_t arrival_ns)
 	bool taken;
 
 	pthread_mutex_lock(&w->lock);
-	taken = w->status.queued < WORKER_ROWS_MAX;
+	taken = (w->params.patient || w->status.queued < WORKER_ROWS_MAX) &&
+	        push(w, (struct item){ITEM_ROW, row, arrival_ns});
 	if (taken) {
-		push(w, (struct item){ITEM_ROW, row, arrival_ns});
 		w->status.queued++;
 		if (w->status.queued_peak < w->status.queued)
 			w->status.queued_peak = w->status.queued;
@@ -301,7 +334,17 @@ bool worker_row(struct worker *w, struct row *row, int64_t arrival_ns)
 	return taken;
 }
 
-/* Without rows between them, what comes after an equal or a stronger one changes nothing; so at most flush, reset, end stand
+bool worker_room(struct worker *w)
+{
+	bool room;
+
+	pthread_mutex_lock(&w->lock);
+	room = w->status.queued < WORKER_ROWS_MAX;
+	pthread_mutex_unlock(&w->lock);
+	return room;
+}
+
+/* Without rows between them, what comes after an equal or a stronger one changes nothing; so at most a wish, flush, reset, end stand
  * in a row. */
 static void push_control(struct worker *w, enum item_kind kind)
 {
@@ -309,10 +352,22 @@ static void push_control(struct worker *w, enum item_kind kind)
 
 	pthread_mutex_lock(&w->lock);
 	if (w->items > 0)
-		last = w->item[(w->first + w->items - 1) % ITEMS_MAX].kind;
+		last = w->item[(w->first + w->items - 1) % w->cap].kind;
 	if (last < kind)
 		push(w, (struct item){.kind = kind});
 	pthread_mutex_unlock(&w->lock);
+}
+
+void worker_hold(struct worker *w, bool hold)
+{
+	w->hold = hold;
+	if (!hold)
+		push_control(w, ITEM_MESH);
+}
+
+void worker_mesh(struct worker *w)
+{
+	push_control(w, ITEM_MESH);
 }
 
 void worker_flush(struct worker *w)
@@ -362,6 +417,7 @@ void worker_status(struct worker *w, struct worker_status *ret)
 {
 	pthread_mutex_lock(&w->lock);
 	*ret = w->status;
+	ret->idle = w->idle && w->items == 0 && w->results == 0;
 	pthread_mutex_unlock(&w->lock);
 }
 

@@ -64,7 +64,7 @@ static void host_log(void *ctx, int priority, const char *text)
 	(void)text;
 }
 
-static const struct server_host host = {NULL, host_now, host_status, host_command, host_log, NULL, NULL};
+static const struct server_host host = {NULL, host_now, host_status, host_command, host_log, NULL, NULL, false};
 
 static int set_up(void **state)
 {
@@ -405,7 +405,7 @@ static void what_comes_later_is_refused_by_name(void **state)
 	peer_unix(&peer);
 	peer_line(&peer, "?SAVE={}\n?SEEK={}\n?SWEEP={\n?NONE\n{}\n?WATCH=[]\n?WATCH={\"enable\":1}\n");
 	expect_heard(&peer, "a name is needed");
-	expect_heard(&peer, "?SEEK comes");
+	expect_heard(&peer, "say where to, or how fast");
 	expect_heard(&peer, "?SWEEP comes");
 	expect_heard(&peer, "not a command");
 	expect_heard(&peer, "a JSON object with");

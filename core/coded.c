@@ -1,25 +1,39 @@
 /* One patch in few bytes.
  *
- *   | varint n | key x y z | version | t_first | t_last | n bytes of range-coded body |
+ *   | varint n | key x y z | version | i64 t_last | i64 t_first | body ... |      n counts everything after itself
  *
- * The body is one number in [0, 1), narrowed by binary decisions (a range coder, as in Martin 1979), each with a
- * probability that its context has learnt so far. Contexts are born anew with every patch, from a table of what such
- * patches are like, so that a patch needs no other one to be read. Encoder and decoder are one walk over the patch: every
- * step calls code_*(value), which in the one direction writes the value and in the other ignores it and returns what was
- * read; neither can drift from the other.
+ * The body is one number in [0, 1), narrowed by binary decisions (a range coder: Martin 1979), each with a probability that
+ * its context has learnt so far. Contexts begin anew with every patch, from a table of what patches are like, so that none
+ * needs another one to be read. Encoder and decoder are one walk over the patch: every step calls code_*(value), which in
+ * the one direction writes the value and in the other ignores it and returns what was read; so neither drifts from the
+ * other. Times stay whole bytes beside the body: they are those of rows, the same in many patches, which zstd finds.
  *
- * What is exploited: a vertex of marching cubes lies on an edge of the grid, so two of its coordinates are multiples of
- * 256 and near those of the vertex before; the third is near that of the last vertex of its kind, on the same wall. A
- * triangle most often shares an edge with a recent one, and its third corner is then new, or closes a gap between two
- * open edges, or stands near by in the order of the vertices, which is one of space. */
+ * What is exploited: most vertices of marching cubes lie on an edge of the grid, so two coordinates are multiples of 256,
+ * near those of the vertex before; the third is near that of the last vertex of its kind, on the same wall. A triangle
+ * mostly shares an edge with a recent one. Its third corner then closes a gap between two open edges, or is one of the
+ * vertices nearest to that edge, and whether it was used before is told first. Tried without gain: several walls
+ * remembered at once; a place pushed away from the neighbour instead of the middle of the edge. */
 #include "core/coded.h"
+#include "core/coded_table.h"
 
 #include <assert.h>
 #include <errno.h>
 #include <stdio.h>
 #include <string.h>
 
-enum { BITS = 17, NUMBER = 2 * BITS, SIGNED = NUMBER + 1, EDGES = 24 };
+enum {
+	EDGES = 24,   /* open edges that are remembered */
+	NEAR = 16,    /* vertices near a place that have a rank */
+	WINDOW = 256, /* vertices that are looked at for them */
+	CERTAIN = 12, /* so many decisions the table counts for */
+	SLOWEST = 40, /* so many decisions at most a context counts */
+	PROBABLE_MIN = 64,
+};
+
+/* Contexts of a number below 2^bits - 1, and of one with a sign. */
+#define NUMBER(bits) (2 * (bits))
+#define SIGNED(bits) (2 * (bits) + 1)
+enum { COUNT_BITS = 17, CLASS_BITS = 9, KIND_BITS = 2, STEP_BITS = 5, REST_BITS = 13, RANK_BITS = 5 };
 
 /* How likely the next decision is a zero, in 1/65536, and after how many it was learnt. */
 struct context {
@@ -27,13 +41,20 @@ struct context {
 	uint8_t n;
 };
 
+/* In the order of the table. First index or indices: what the decision depends on. */
 struct contexts {
-	struct context count[3][NUMBER];
-	struct context plane[SIGNED], class[SIGNED], share[NUMBER];
 	struct context rotated[1], rotation[4];
-	struct context mask[8][8], step[6][SIGNED], rest[9][SIGNED];
-	struct context edge[3][32], corner[3][4], near[4][SIGNED], first[3][SIGNED];
+	struct context triangles[NUMBER(COUNT_BITS)], vertices[SIGNED(COUNT_BITS)], runs[NUMBER(COUNT_BITS)];
+	struct context plane[NUMBER(KIND_BITS)], class[NUMBER(CLASS_BITS)], share[NUMBER(COUNT_BITS)];
+	struct context mask[8][8];                                /* mask before */
+	struct context step[3][2][5][SIGNED(STEP_BITS)];          /* axis; moved; what is known of the surface */
+	struct context rest[2][3][SIGNED(REST_BITS)], low[3][8];  /* free on one axis only; axis */
+	struct context edge[6][32], corner[4][4];                 /* edge before; open ends */
+	struct context fresh[2][2], first[2][SIGNED(COUNT_BITS)]; /* the first of a run; corner */
+	struct context rank[3][2][NUMBER(RANK_BITS)], far[2][SIGNED(COUNT_BITS)]; /* corner; used */
 };
+
+_Static_assert(sizeof(struct contexts) == CODED_CONTEXTS * sizeof(struct context), "the table has every context once");
 
 struct coder {
 	struct buffer *out; /* NULL: this one reads */
@@ -92,11 +113,11 @@ static bool code_bit(struct coder *coder, struct context *context, bool bit)
 		context->p = (uint16_t)(context->p - (context->p * rate >> 16));
 	else
 		context->p = (uint16_t)(context->p + ((65536u - context->p) * rate >> 16));
-	if (context->p < 64)
-		context->p = 64;
-	if (context->p > 65536 - 64)
-		context->p = 65536 - 64;
-	if (context->n < 30)
+	if (context->p < PROBABLE_MIN)
+		context->p = PROBABLE_MIN;
+	if (context->p > 65536 - PROBABLE_MIN)
+		context->p = 65536 - PROBABLE_MIN;
+	if (context->n < SLOWEST)
 		context->n++;
 	return bit;
 }
@@ -112,29 +133,30 @@ static uint32_t code_raw(struct coder *coder, int bits, uint32_t value)
 static uint32_t code_tree(struct coder *coder, struct context *tree, int bits, uint32_t value)
 {
 	uint32_t node = 1;
-	while (bits-- > 0)
-		node = node << 1 | code_bit(coder, &tree[node], value >> bits & 1);
-	return node;
+	for (int i = bits; i-- > 0;)
+		node = node << 1 | code_bit(coder, &tree[node], value >> i & 1);
+	return node - (1u << bits);
 }
 
-/* 0 .. 2^BITS - 2: how many bits value + 1 has, one by one, then all but the first of them; the second is learnt. */
-static uint32_t code_number(struct coder *coder, struct context context[NUMBER], uint32_t value)
+/* 0 .. 2^max - 2: how many bits value + 1 has, one by one, then those after its first; the second of them is learnt. */
+static uint32_t code_number(struct coder *coder, struct context *context, int max, uint32_t value)
 {
 	int bits = 0;
-	while (bits < BITS - 1 && code_bit(coder, &context[bits], (value + 1) >> (bits + 1) > 0))
+	value++;
+	while (bits < max - 1 && code_bit(coder, &context[bits], value >> (bits + 1) > 0))
 		bits++;
 	uint32_t got = 1;
 	if (bits > 0)
-		got = got << 1 | code_bit(coder, &context[BITS + bits], (value + 1) >> (bits - 1) & 1);
+		got = 2 | code_bit(coder, &context[max + bits], value >> (bits - 1) & 1);
 	if (bits > 1)
-		got = got << (bits - 1) | code_raw(coder, bits - 1, (value + 1) & ((1u << (bits - 1)) - 1));
+		got = got << (bits - 1) | code_raw(coder, bits - 1, value & ((1u << (bits - 1)) - 1));
 	return got - 1;
 }
 
-static int32_t code_signed(struct coder *coder, struct context context[SIGNED], int32_t value)
+static int32_t code_signed(struct coder *coder, struct context *context, int max, int32_t value)
 {
-	const int32_t size = (int32_t)code_number(coder, context, (uint32_t)(value < 0 ? -value : value));
-	return size && code_bit(coder, &context[NUMBER], value < 0) ? -size : size;
+	const int32_t size = (int32_t)code_number(coder, context, max, (uint32_t)(value < 0 ? -value : value));
+	return size && code_bit(coder, &context[NUMBER(max)], value < 0) ? -size : size;
 }
 
 /* The walk over a patch */
@@ -150,7 +172,7 @@ enum { PLANE_OF_NONE, PLANE_NEXT, PLANE_OTHER };
 static uint32_t code_plane(struct coder *coder, uint32_t next, uint32_t plane)
 {
 	const uint32_t kind = plane == PLANE_NONE ? PLANE_OF_NONE : plane == next ? PLANE_NEXT : PLANE_OTHER;
-	switch (code_number(coder, coder->contexts.plane, kind)) {
+	switch (code_number(coder, coder->contexts.plane, KIND_BITS, kind)) {
 	case PLANE_OF_NONE:
 		return PLANE_NONE;
 	case PLANE_NEXT:
@@ -166,11 +188,12 @@ static int code_runs(struct coder *coder, struct patch *patch, char error[128])
 	for (uint32_t i = 0; i < patch->nruns; i++) {
 		struct patch_run run = patch->run[i];
 		run.plane = code_plane(coder, next, run.plane);
-		run.class = (uint8_t)code_number(coder, coder->contexts.class, run.class);
+		run.class = (uint8_t)code_number(coder, coder->contexts.class, CLASS_BITS, run.class);
 		if (i + 1 == patch->nruns)
 			run.triangles = (uint16_t)left;
 		else
-			run.triangles = (uint16_t)(1 + code_number(coder, coder->contexts.share, run.triangles - 1u));
+			run.triangles =
+			    (uint16_t)(1 + code_number(coder, coder->contexts.share, COUNT_BITS, run.triangles - 1u));
 		if (run.triangles == 0 || run.triangles > left)
 			return refuse(error, "a CODED patch whose runs do not add up to its triangles");
 		left -= run.triangles;
@@ -193,13 +216,19 @@ static int code_coordinate(struct coder *coder, const struct trail *trail, uint3
                            int value)
 {
 	struct contexts *contexts = &coder->contexts;
-	if (mask >> axis & 1) {
-		const bool alone = (mask & (mask - 1)) == 0, seen = trail->seen >> mask & 1;
-		const int from = seen ? trail->like[mask][axis] : trail->last[axis];
-		return from + code_signed(coder, contexts->rest[(seen ? alone ? 0 : 3 : 6) + axis], value - from);
-	}
-	const int from = trail->last[axis] / LATTICE;
-	return (from + code_signed(coder, contexts->step[2 * axis + moved], value / LATTICE - from)) * LATTICE;
+	const bool is_free = mask >> axis & 1, alone = (mask & (mask - 1)) == 0, seen = trail->seen >> mask & 1;
+	const int from = trail->last[axis] / LATTICE, like = trail->like[mask][axis], stood = like / LATTICE;
+	const int kind = !is_free ? 0 : !seen ? 1 : stood < from ? 2 : stood == from ? 3 : 4;
+	const int cell =
+	    from + code_signed(coder, contexts->step[axis][moved][kind], STEP_BITS, value / LATTICE - from);
+	if (!is_free)
+		return cell * LATTICE;
+	if (seen && stood == cell)
+		return like + code_signed(coder, contexts->rest[alone][axis], REST_BITS, value - like);
+	const int d = seen ? cell - stood : 0;
+	struct context *tree = contexts->low[d == 1 ? 1 : d == -1 ? 2 : 0];
+	const uint32_t high = code_tree(coder, tree, 3, (uint32_t)value % LATTICE >> 5);
+	return cell * LATTICE + (int)(high << 5 | code_raw(coder, 5, value & 31));
 }
 
 static int code_vertices(struct coder *coder, struct patch *patch, char error[128])
@@ -211,7 +240,7 @@ static int code_vertices(struct coder *coder, struct patch *patch, char error[12
 		int at[3], moved = 0;
 		for (int axis = 0; axis < 3; axis++)
 			mask |= (uint32_t)(vertex[axis] % LATTICE != 0) << axis;
-		mask = code_tree(coder, coder->contexts.mask[trail.mask], 3, mask) & 7;
+		mask = code_tree(coder, coder->contexts.mask[trail.mask], 3, mask);
 		for (int axis = 2; axis >= 0; axis--) {
 			at[axis] = code_coordinate(coder, &trail, mask, axis, moved, vertex[axis]);
 			if (at[axis] < 0 || at[axis] > PATCH_SIDE * LATTICE)
@@ -228,84 +257,163 @@ static int code_vertices(struct coder *coder, struct patch *patch, char error[12
 	return 0;
 }
 
-/* Edges that one triangle has and no other one yet, newest first. */
-struct open_edges {
-	uint32_t n;
-	uint32_t edge[EDGES][2];
+/* What the triangles before tell of the next one: edges that one of them has and no other one yet, newest first, each with
+ * the corner beside it, and which vertices they have used. */
+struct trace {
+	const struct patch *patch;
+	uint32_t n, edge[EDGES][3];
+	uint8_t used[(PATCH_VERTICES_MAX + 8) / 8];
 };
 
-static void close_edge(struct open_edges *open, uint32_t at)
+static bool is_used(const struct trace *trace, uint32_t i)
 {
-	open->n--;
-	memmove(open->edge + at, open->edge + at + 1, (open->n - at) * sizeof(*open->edge));
+	return trace->used[i / 8] >> i % 8 & 1;
 }
 
-/* The triangle's edge from a to b: it closes the one from b to a, or stands open itself. */
-static void add_edge(struct open_edges *open, uint32_t a, uint32_t b)
+static void close_edge(struct trace *trace, uint32_t at)
 {
-	for (uint32_t i = 0; i < open->n; i++)
-		if (open->edge[i][0] == b && open->edge[i][1] == a) {
-			close_edge(open, i);
+	trace->n--;
+	memmove(trace->edge + at, trace->edge + at + 1, (trace->n - at) * sizeof(*trace->edge));
+}
+
+/* The edge from a to b of a triangle: it closes the one from b to a, or stands open itself. */
+static void add_edge(struct trace *trace, uint32_t a, uint32_t b, uint32_t beside)
+{
+	for (uint32_t i = 0; i < trace->n; i++)
+		if (trace->edge[i][0] == b && trace->edge[i][1] == a) {
+			close_edge(trace, i);
 			return;
 		}
-	if (open->n == EDGES)
-		open->n--;
-	memmove(open->edge + 1, open->edge, open->n * sizeof(*open->edge));
-	open->edge[0][0] = a;
-	open->edge[0][1] = b;
-	open->n++;
+	if (trace->n == EDGES)
+		trace->n--;
+	memmove(trace->edge + 1, trace->edge, trace->n * sizeof(*trace->edge));
+	trace->edge[0][0] = a;
+	trace->edge[0][1] = b;
+	trace->edge[0][2] = beside;
+	trace->n++;
 }
 
-/* The newest open edge that the triangle closes, and the corner that follows it in the triangle; open->n: none. */
-static uint32_t find_edge(const struct open_edges *open, const uint32_t t[3], int *ret_corner)
+/* The newest open edge that the triangle closes, and the corner that follows it in the triangle; trace->n: none. */
+static uint32_t find_edge(const struct trace *trace, const uint32_t t[3], int *ret_corner)
 {
-	for (uint32_t i = 0; i < open->n; i++)
+	for (uint32_t i = 0; i < trace->n; i++)
 		for (int c = 0; c < 3; c++)
-			if (open->edge[i][0] == t[(c + 1) % 3] && open->edge[i][1] == t[c]) {
+			if (trace->edge[i][0] == t[(c + 1) % 3] && trace->edge[i][1] == t[c]) {
 				*ret_corner = (c + 2) % 3;
 				return i;
 			}
 	*ret_corner = 0;
-	return open->n;
+	return trace->n;
 }
 
-enum { CORNER_NEW, CORNER_AFTER, CORNER_BEFORE, CORNER_OTHER };
-
-/* The corner beside an edge a -> b that is closed: the next new vertex, one at the end of an open edge of a or b, or any. */
-static uint32_t code_corner(struct coder *coder, const struct open_edges *open, uint32_t edge, uint32_t fresh,
-                            uint32_t value)
+/* The vertices, used or not, that are nearest to a place (in half units), in that order, but for three. */
+static uint32_t find_nearest(const struct trace *trace, bool used, const int32_t place[3], const uint32_t but[3],
+                             uint32_t about, uint32_t ret[NEAR])
 {
-	const uint32_t a = open->edge[edge][0], b = open->edge[edge][1];
-	uint32_t after = UINT32_MAX, before = UINT32_MAX, kind = CORNER_OTHER;
-	for (uint32_t i = open->n; i-- > 0;) {
-		if (i != edge && open->edge[i][0] == b && open->edge[i][1] != a)
-			after = open->edge[i][1];
-		if (i != edge && open->edge[i][1] == a && open->edge[i][0] != b)
-			before = open->edge[i][0];
+	const struct patch *patch = trace->patch;
+	uint32_t distance[NEAR], n = 0, end = patch->nv;
+	uint32_t i = 0;
+
+	if (patch->nv > WINDOW) {
+		i = about < WINDOW / 2 ? 0 : about - WINDOW / 2;
+		end = i + WINDOW < end ? i + WINDOW : end;
 	}
-	kind = value == fresh    ? CORNER_NEW
-	       : value == after  ? CORNER_AFTER
-	       : value == before ? CORNER_BEFORE
-	                         : CORNER_OTHER;
-	struct context *tree = coder->contexts.corner[(after != UINT32_MAX) + (before != UINT32_MAX)];
-	kind = code_tree(coder, tree, 2, kind) & 3;
-	if (kind == CORNER_NEW)
-		return fresh;
+	for (; i < end; i++) {
+		if (is_used(trace, i) != used || i == but[0] || i == but[1] || i == but[2])
+			continue;
+		uint32_t far = 0, at;
+		for (int axis = 0; axis < 3; axis++) {
+			const int32_t d = 2 * patch->vertex[i][axis] - place[axis];
+			far += (uint32_t)(d * d);
+		}
+		if (n == NEAR && far >= distance[NEAR - 1])
+			continue;
+		n += n < NEAR;
+		for (at = n - 1; at > 0 && distance[at - 1] > far; at--) {
+			distance[at] = distance[at - 1];
+			ret[at] = ret[at - 1];
+		}
+		distance[at] = far;
+		ret[at] = i;
+	}
+	return n;
+}
+
+/* A vertex by its rank among those near a place; one that is not is told by its distance from `about` in their order. */
+static uint32_t code_near(struct coder *coder, const struct trace *trace, int kind, bool used, const int32_t place[3],
+                          const uint32_t but[3], uint32_t about, uint32_t value)
+{
+	uint32_t near[NEAR], rank = 0;
+	const uint32_t n = find_nearest(trace, used, place, but, about, near);
+	while (rank < n && near[rank] != value)
+		rank++;
+	rank = code_number(coder, coder->contexts.rank[kind][used], RANK_BITS, rank);
+	if (rank < n)
+		return near[rank];
+	return about + (uint32_t)code_signed(coder, coder->contexts.far[used], COUNT_BITS, (int32_t)(value - about));
+}
+
+enum { CORNER_UNUSED, CORNER_USED, CORNER_AFTER, CORNER_BEFORE };
+
+/* The corner beside an edge a -> b that is closed: at the end of an open edge of a or b, or near by. */
+static uint32_t code_corner(struct coder *coder, const struct trace *trace, uint32_t edge, uint32_t value)
+{
+	const uint32_t a = trace->edge[edge][0], b = trace->edge[edge][1], d = trace->edge[edge][2];
+	uint32_t after = UINT32_MAX, before = UINT32_MAX, kind;
+	for (uint32_t i = trace->n; i-- > 0;) {
+		if (trace->edge[i][0] == b && trace->edge[i][1] != a)
+			after = trace->edge[i][1];
+		if (trace->edge[i][1] == a && trace->edge[i][0] != b)
+			before = trace->edge[i][0];
+	}
+	kind = value == after                                      ? CORNER_AFTER
+	       : value == before                                   ? CORNER_BEFORE
+	       : value < trace->patch->nv && is_used(trace, value) ? CORNER_USED
+	                                                           : CORNER_UNUSED;
+	const int ends = (after != UINT32_MAX) + 2 * (before != UINT32_MAX);
+	kind = code_tree(coder, coder->contexts.corner[ends], 2, kind);
 	if (kind == CORNER_AFTER)
 		return after;
 	if (kind == CORNER_BEFORE)
 		return before;
-	const int64_t from = a > b ? a : b;
-	return (uint32_t)(from + code_signed(coder, coder->contexts.near[0], (int32_t)(value - from)));
+	int32_t place[3];
+	const uint32_t but[3] = {a, b, d};
+	for (int axis = 0; axis < 3; axis++) {
+		const uint16_t(*v)[3] = (const uint16_t(*)[3])trace->patch->vertex;
+		place[axis] = v[a][axis] + v[b][axis];
+	}
+	return code_near(coder, trace, 0, kind == CORNER_USED, place, but, a > b ? a : b, value);
 }
 
-static void code_alone(struct coder *coder, uint32_t fresh, const uint32_t last[3], uint32_t t[3])
+static bool code_used(struct coder *coder, const struct trace *trace, bool begins, int corner, uint32_t value)
 {
-	struct contexts *contexts = &coder->contexts;
-	(void)fresh;
-	t[0] = last[0] + (uint32_t)code_signed(coder, contexts->first[0], (int32_t)(t[0] - last[0]));
-	t[1] = t[0] + (uint32_t)code_signed(coder, contexts->first[1], (int32_t)(t[1] - t[0]));
-	t[2] = t[1] + (uint32_t)code_signed(coder, contexts->first[2], (int32_t)(t[2] - t[1]));
+	return code_bit(coder, &coder->contexts.fresh[begins][corner],
+	                value < trace->patch->nv && is_used(trace, value));
+}
+
+/* A triangle that closes no edge: each corner near the one before. False: there is no such vertex. */
+static bool code_alone(struct coder *coder, const struct trace *trace, bool begins, const uint32_t last[3],
+                       uint32_t t[3])
+{
+	uint32_t got[3] = {UINT32_MAX, UINT32_MAX, UINT32_MAX};
+	uint32_t about = last[0] + (uint32_t)code_signed(coder, coder->contexts.first[begins], COUNT_BITS,
+	                                                 (int32_t)(t[0] - last[0]));
+	if (about >= trace->patch->nv)
+		return false;
+	got[0] = about;
+	const uint16_t(*v)[3] = (const uint16_t(*)[3])trace->patch->vertex;
+	for (int c = 1; c < 3; c++) {
+		int32_t place[3];
+		for (int axis = 0; axis < 3; axis++)
+			place[axis] = c < 2 ? 2 * v[about][axis] : v[got[0]][axis] + v[got[1]][axis];
+		const bool used = code_used(coder, trace, begins, c - 1, t[c]);
+		got[c] = code_near(coder, trace, c, used, place, got, about, t[c]);
+		if (got[c] >= trace->patch->nv)
+			return false;
+		about = got[c];
+	}
+	memcpy(t, got, sizeof(got));
+	return true;
 }
 
 /* To begin with the smallest index, as all our meshes do. */
@@ -326,43 +434,59 @@ static int judge_triangle(const struct patch *patch, const uint32_t t[3], char e
 
 static int code_triangles(struct coder *coder, struct patch *patch, bool rotated, char error[128])
 {
-	struct open_edges open = {0};
-	uint32_t last[3] = {0}, fresh = 0, context = 0;
+	struct trace trace = {.patch = patch};
+	uint32_t last[3] = {0}, context = 0, run = 0, left = 0;
 	for (uint32_t i = 0; i < patch->nt; i++) {
+		const bool begins = left == 0;
+		if (begins)
+			left = patch->run[run++].triangles;
+		left--;
 		uint32_t t[3], got[3];
+
 		memcpy(t, patch->triangle[i], sizeof(t));
 		int corner = 0, turn = 0;
-		uint32_t edge = find_edge(&open, t, &corner);
-		edge = edge == open.n ? 0 : edge + 1;
-		edge = code_tree(coder, coder->contexts.edge[context], 5, edge) & 31;
-		context = edge == 0 ? 0 : edge == 1 ? 1 : 2;
-		if (edge > open.n)
+		uint32_t edge = find_edge(&trace, t, &corner);
+		edge = edge == trace.n ? 0 : edge + 1;
+		edge = code_tree(coder, coder->contexts.edge[begins ? 5 : context], 5, edge);
+		context = edge < 3 ? edge : edge < 8 ? 3 : 4;
+		if (edge > trace.n)
 			return refuse(error, "a CODED patch with a triangle at an edge that is not there");
 		if (edge > 0) {
-			got[0] = open.edge[edge - 1][1];
-			got[1] = open.edge[edge - 1][0];
-			got[2] = code_corner(coder, &open, edge - 1, fresh, t[corner]);
+			got[0] = trace.edge[edge - 1][1];
+			got[1] = trace.edge[edge - 1][0];
+			got[2] = code_corner(coder, &trace, edge - 1, t[corner]);
 		} else {
 			memcpy(got, t, sizeof(got));
-			code_alone(coder, fresh, last, got);
+			if (!code_alone(coder, &trace, begins, last, got))
+				return refuse(error, "a CODED patch with an index beyond its vertices");
 		}
 		if (judge_triangle(patch, got, error) < 0)
 			return -EPROTO;
 		const int first = smallest(got);
 		if (rotated) {
-			turn = (smallest(t) - 0 + 3) % 3;
-			turn = (int)(code_tree(coder, coder->contexts.rotation, 2, (uint32_t)turn) & 3) % 3;
+			turn = smallest(t);
+			turn = (int)code_tree(coder, coder->contexts.rotation, 2, (uint32_t)turn) % 3;
 		}
 		for (int c = 0; c < 3; c++) {
 			last[c] = got[(first + c) % 3];
 			patch->triangle[i][(c + turn) % 3] = last[c];
 		}
 		for (int c = 0; c < 3; c++) {
-			fresh = last[c] >= fresh ? last[c] + 1 : fresh;
-			add_edge(&open, last[c], last[(c + 1) % 3]);
+			trace.used[last[c] / 8] |= (uint8_t)(1 << last[c] % 8);
+			add_edge(&trace, last[c], last[(c + 1) % 3], last[(c + 2) % 3]);
 		}
 	}
 	return 0;
+}
+
+/* False: there is no such patch. */
+static bool code_counts(struct coder *coder, uint32_t *nv, uint32_t *nt, uint32_t *nruns)
+{
+	struct contexts *contexts = &coder->contexts;
+	*nt = 1 + code_number(coder, contexts->triangles, COUNT_BITS, *nt - 1);
+	*nv = *nt + (uint32_t)code_signed(coder, contexts->vertices, COUNT_BITS, (int32_t)(*nv - *nt));
+	*nruns = 1 + code_number(coder, contexts->runs, COUNT_BITS, *nruns - 1);
+	return *nt <= UINT16_MAX && *nv >= 3 && *nv <= PATCH_VERTICES_MAX && *nruns <= *nt;
 }
 
 static int code_body(struct coder *coder, struct patch *patch, char error[128])
@@ -381,7 +505,7 @@ static void start(struct coder *coder)
 {
 	struct context *context = (struct context *)&coder->contexts;
 	for (size_t i = 0; i < sizeof(coder->contexts) / sizeof(*context); i++)
-		context[i] = (struct context){.p = 1u << 15};
+		context[i] = (struct context){.p = (uint16_t)(coded_table[i] << 8), .n = CERTAIN};
 	coder->range = UINT32_MAX;
 	for (int i = 0; !coder->out && i < 4; i++)
 		next_byte(coder);
@@ -434,12 +558,9 @@ static size_t put_head(uint8_t head[HEAD_MAX], const struct patch *patch)
 	p = put_varint(p, zigzag(patch->key.y));
 	p = put_varint(p, zigzag(patch->key.z));
 	p = put_varint(p, patch->version);
-	memcpy(p, &patch->t_first_ns, 8);
-	memcpy(p + 8, &patch->t_last_ns, 8);
-	p = put_varint(p + 16, patch->nv);
-	p = put_varint(p, patch->nt);
-	p = put_varint(p, patch->nruns);
-	return (size_t)(p - head);
+	memcpy(p, &patch->t_last_ns, 8); /* version and last time are those of one row: zstd finds them together */
+	memcpy(p + 8, &patch->t_first_ns, 8);
+	return (size_t)(p + 16 - head);
 }
 
 void coded_put_patch(struct buffer *out, const struct patch *patch)
@@ -456,8 +577,10 @@ void coded_put_patch(struct buffer *out, const struct patch *patch)
 		return;
 	}
 	start(&coder);
+	const bool counted = code_counts(&coder, &copy->nv, &copy->nt, &copy->nruns);
 	const int r = code_body(&coder, copy, error);
-	assert(r == 0);
+	assert(counted && r == 0);
+	(void)counted;
 	(void)r;
 	/* The shortest number within what is left; the reader goes on with zeros. */
 	const uint32_t last = (uint32_t)(coder.low + 0xffffff);
@@ -503,50 +626,41 @@ static bool get_key(const uint8_t **p, const uint8_t *end, struct patch_key *ret
 	return true;
 }
 
-/* A zeroed patch of the size that the head announces; NULL with a sentence. */
-static struct patch *get_head(const uint8_t **p, const uint8_t *end, char error[128])
+/* All but the counts, which the body begins with. */
+static int get_head(const uint8_t **p, const uint8_t *end, struct patch *ret, char error[128])
 {
-	struct patch_key key;
-	uint64_t version, nv, nt, nruns;
-	const uint8_t *times;
-	if (!get_key(p, end, &key)) {
-		refuse(error, "a CODED patch without a key, or beyond the limits of the map");
-		return NULL;
-	}
-	if (!get_varint(p, end, &version) || end - *p < 16) {
-		refuse(error, "a CODED patch that is too short");
-		return NULL;
-	}
-	times = *p;
+	if (!get_key(p, end, &ret->key))
+		return refuse(error, "a CODED patch without a key, or beyond the limits of the map");
+	if (!get_varint(p, end, &ret->version) || end - *p < 16)
+		return refuse(error, "a CODED patch that is too short");
+	memcpy(&ret->t_last_ns, *p, 8);
+	memcpy(&ret->t_first_ns, *p + 8, 8);
 	*p += 16;
-	if (!get_varint(p, end, &nv) || !get_varint(p, end, &nt) || !get_varint(p, end, &nruns) || nv < 3 ||
-	    nv > PATCH_VERTICES_MAX || nt < 1 || nt > UINT16_MAX || nruns < 1 || nruns > nt ||
-	    nv + nt > (uint64_t)(end - *p) * CODED_SHARE) {
-		refuse(error, "a CODED patch with impossible counts");
-		return NULL;
-	}
-	struct patch *patch = patch_allocate(key, (uint32_t)nv, (uint32_t)nt, (uint32_t)nruns);
-	if (!patch) {
-		refuse(error, "no memory for a CODED patch");
-		return NULL;
-	}
-	patch->version = version;
-	memcpy(&patch->t_first_ns, times, 8);
-	memcpy(&patch->t_last_ns, times + 8, 8);
-	return patch;
+	return 0;
 }
 
 int coded_get_patch(const uint8_t *data, size_t len, struct patch **ret, char error[128])
 {
 	const uint8_t *p = data, *end = data + len;
+	struct patch head = {.nt = 1}, *patch;
 	uint64_t n;
 	if (!get_varint(&p, end, &n) || n != (uint64_t)(end - p))
 		return refuse(error, "a CODED patch of the wrong length");
-	struct patch *patch = get_head(&p, end, error);
-	if (!patch)
+	if (get_head(&p, end, &head, error) < 0)
 		return -EPROTO;
 	struct coder coder = {.in = p, .end = end};
 	start(&coder);
+	if (!code_counts(&coder, &head.nv, &head.nt, &head.nruns) ||
+	    head.nv + head.nt > (size_t)(end - p) * CODED_SHARE)
+		return refuse(error, "a CODED patch with impossible counts");
+	patch = patch_allocate(head.key, head.nv, head.nt, head.nruns);
+	if (!patch) {
+		refuse(error, "no memory for a CODED patch");
+		return -ENOMEM;
+	}
+	patch->version = head.version;
+	patch->t_first_ns = head.t_first_ns;
+	patch->t_last_ns = head.t_last_ns;
 	const int r = code_body(&coder, patch, error);
 	if (r < 0)
 		patch_unref(patch);

@@ -12,7 +12,7 @@
  * shuts nobody out. What libwebsockets would log is not: strangers could fill the log with it.
  *
  * Traps of libwebsockets 4.1: the loop needs its plugin for libuv at run time; it speaks h2c and CONNECT unless they are
- * refused; a context on a foreign loop is destroyed twice, before and after the loop ran dry. */
+ * refused; a context on a foreign loop is destroyed twice, before and after the loop ran dry; it takes frames that are not masked. */
 #include "daemon/web.h"
 
 #ifdef HAVE_WEB
@@ -40,6 +40,7 @@
 #define ACCEPTS_MAX     16 /* in one turn */
 #define HEADER_S        10 /* for a request to come, and for an answer to go on */
 #define KEPT_S          15 /* an idle connection is kept open for another request */
+#define CLOSE_S         2  /* for a client that is told to go */
 #define SNAPSHOT_S      60 /* for a snapshot to be made */
 #define HEADERS_MAX     4096
 #define SETTLE_NS       10000000ll /* after the handshake; see web_language.open */
@@ -76,6 +77,7 @@ struct web_connection {
 	struct buffer in; /* a message that is coming */
 	bool in_text;
 	int close_code;
+	bool said_close;
 	char reason[WEB_REASON_MAX + 1];
 };
 
@@ -385,10 +387,23 @@ static int on_established(struct web_connection *c, const struct lws_protocols *
 	return 0;
 }
 
+/* The close frame is written here: left to libwebsockets, a build of it for debugging (Debian's is one) drops the
+ * connection before the frame is out. The client closes then, or is closed. */
 static int close_now(struct web_connection *c)
 {
-	lws_close_reason(c->wsi, (enum lws_close_status)c->close_code, (unsigned char *)c->reason, strlen(c->reason));
-	return -1;
+	uint8_t *to = c->web->out + LWS_PRE;
+	const size_t len = strlen(c->reason);
+
+	if (c->said_close)
+		return 0;
+	c->said_close = true;
+	to[0] = 0x88;
+	to[1] = (uint8_t)(len + 2);
+	to[2] = (uint8_t)(c->close_code >> 8);
+	to[3] = (uint8_t)c->close_code;
+	memcpy(to + 4, c->reason, len);
+	lws_set_timeout(c->wsi, PENDING_TIMEOUT_CLOSE_ACK, CLOSE_S);
+	return lws_write(c->wsi, to, len + 4, LWS_WRITE_HTTP /* as it is */) < 0 ? -1 : 0;
 }
 
 /* One piece. Its bytes, 0: nothing to say, -1: the connection is to be closed. */

@@ -440,6 +440,8 @@ static enum verdict read_event(struct recording_reader *r, const uint8_t *data, 
 		verdict = damaged(ret, "an event that is none");
 	else if (strcmp(class, "BEGIN") == 0)
 		verdict = read_begin(r, json, ret);
+	else if (strcmp(class, "GAP") == 0)
+		verdict = damaged(ret, "a part was damaged and left out");
 	else if (strcmp(class, "END") == 0)
 		ret->kind = RECORDING_END;
 	else if (strcmp(class, "ROW") == 0 && json_is_integer(number) && json_integer_value(number) >= 0) {

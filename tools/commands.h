@@ -8,6 +8,9 @@ int watch_main(int argc, char **argv);
 int save_main(int argc, char **argv);
 int simulate_main(int argc, char **argv);
 int picture_main(int argc, char **argv);
+int record_main(int argc, char **argv);
+int info_main(int argc, char **argv);
+int repair_main(int argc, char **argv);
 int replay_main(int argc, char **argv);
 int devices_main(int argc, char **argv);
 

@@ -231,7 +231,11 @@ static void put_clients(struct buffer *b, const struct control_status *s)
 
 static void put_publisher(struct buffer *b, const struct publisher_stats *p)
 {
-	static const char *const form[PUBLISHER_FORMS] = {"native", "coded", "scene json", "scene protobuf"};
+	static const char *const form[PUBLISHER_FORMS] = {[PUBLISHER_NATIVE] = "native",
+	                                                  [PUBLISHER_CODED] = "coded",
+	                                                  [PUBLISHER_PACKED] = "packed",
+	                                                  [PUBLISHER_SCENE_JSON] = "scene json",
+	                                                  [PUBLISHER_SCENE_PROTOBUF] = "scene protobuf"};
 
 	gauge(b, "encoded_bytes", "Patches as they are sent.", (double)p->bytes);
 	gauge(b, "pinned_bytes", "Patches that are no longer new and not yet sent.", (double)p->pinned);

@@ -1136,10 +1136,12 @@ static bool begin_parts(struct daemon *d, const struct daemon_options *options)
 static int begin_web(struct daemon *d, const struct server_host *server)
 {
 	const struct web_host host = {*server, put_metrics, d->snapshots, d->replay != NULL};
+	bool elsewhere; /* not a mistake in what was configured */
 	int r;
 
 	d->web = web_create(&d->loop, d->config, d->publisher, &host, &r, d->error);
-	if (!d->web && r < 0 && !d->config->listen.http_set) {
+	elsewhere = r == -EADDRINUSE || r == -EADDRNOTAVAIL || r == -EACCES || r == -ENOTSUP;
+	if (!d->web && elsewhere && !d->config->listen.http_set) {
 		log_line(LOG_WARNING, "%s; the map goes on without it", d->error);
 		return 0;
 	}
@@ -1225,6 +1227,7 @@ int daemon_run(const struct config *config, const struct daemon_options *options
 		r = d->failure;
 	} else {
 		close_all(d);
+		uv_run(&d->loop, UV_RUN_DEFAULT);
 	}
 	/* Devices are closed with their supervisor, whose descriptors are then no longer polled. */
 	finish(d);

@@ -297,9 +297,12 @@ watch_standstills() {
 # Lost although nothing was done to it, or not come: where the machine stood still for a heartbeat or longer that says nothing
 # of facetd.
 starved_or_fail() {
+    ! stood_still 1000 || skip "this machine is too busy: it stood still for $standstill ms, and $*"
+    fail "$* (this machine stood still for $standstill ms at most)"
+}
+stood_still() { # MS
     standstill=$(cat $scratch/standstill)
-    [ "${standstill:-0}" -lt 1000 ] || skip "this machine is too busy: it stood still for $standstill ms, and $*"
-    fail "$*"
+    [ "${standstill:=0}" -ge "$1" ]
 }
 # untouched: sweeps, amid its way, and was not lost since $lost was counted.
 untouched() {
@@ -309,15 +312,19 @@ untouched() {
     [ "$losses" = "$lost" ] || starved_or_fail "the servo was lost by itself: $losses times, $lost before"
 }
 sweeps_again() { # WHEN: $again, the ms since $began
-    until_true 90 moves || starved_or_fail "it does not sweep $1: $(status_of servo note)"
+    until_true 60 moves_or_starved
+    moves || starved_or_fail "it does not sweep $1: $(status_of servo note)"
     again=$(($(uptime_ms) - began))
     sleep 1.2
     lost=$(status_of servo losses)
 }
+moves_or_starved() { # for so long that the drive missed heartbeats
+    moves || stood_still 2500
+}
 # The drive has to stop by itself: while it is within its sweep, and not because that is over.
 stops() { # WHY
     until_true 30 stands || starved_or_fail "it moves on $1"
-    is_within -63 43 || fail "it stopped at the end of its sweep only, $1"
+    is_within -63 43 || starved_or_fail "it stopped at the end of its sweep only, $1"
 }
 
 # Without the scanner, whose rays are too much for this machine beside. Heartbeats of a second, a slow SYNC and a gentle sweep:
@@ -325,7 +332,7 @@ stops() { # WHY
 can_heartbeats() {
     simulated_robot
     sed -i '/name: laser/,/tilt: servo/d; s/heartbeat: 200ms/heartbeat: 1s, timeout: 5s/; s/sync: 20ms/sync: 50ms/
-        s/speed: 37.5deg/speed: 4deg/' $scratch/facetd.yaml
+        s/speed: 37.5deg/speed: 2deg/' $scratch/facetd.yaml
     watch_standstills
     start_daemon
     until_true 90 is servo state streaming || starved_or_fail "the servo does not stream: $(status_of servo error)"
@@ -342,7 +349,7 @@ can_heartbeats() {
     echo "note: stands $stood ms after facetd was stopped, sweeps $again ms after it goes on"
     untouched
     $ip link set can0 down
-    until_true 20 says 'servo: .*can0 was set down' || fail "the end of the interface is not said"
+    until_true 20 says 'servo: .*can0 was set down' || starved_or_fail "the end of the interface is not said"
     stops "without a master"
     $ip link set can0 up
     began=$(uptime_ms)
@@ -352,11 +359,11 @@ can_heartbeats() {
     untouched
     device=$(/usr/bin/readlink -f /sys/class/net/can0/device)
     echo 1 >"$device/remove"
-    until_true 20 says 'there is no interface can0\|the interface can0 has gone' || fail "that it was pulled out is not said"
+    until_true 20 says 'there is no interface can0\|the interface can0 has gone' || starved_or_fail "that it was pulled out is not said"
     stops "with its wire pulled out"
     echo 1 >/sys/bus/pci/rescan
-    until_true 20 test -e /sys/class/net/can0 || fail "the kernel does not find it again"
-    controller_up can0 || fail "it cannot be set up again"
+    until_true 20 test -e /sys/class/net/can0 || starved_or_fail "the kernel does not find it again"
+    controller_up can0 || starved_or_fail "it cannot be set up again"
     began=$(uptime_ms)
     sweeps_again "after it was plugged in again"
     echo "note: sweeps $again ms after it was plugged in again; this machine stood still for $(cat $scratch/standstill) ms at most"

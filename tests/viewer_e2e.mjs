@@ -2,7 +2,7 @@
 // The devices and facetd are two processes here, so that facetd can be ended and started again.
 import assert from 'node:assert/strict';
 import { spawn } from 'node:child_process';
-import { existsSync, mkdtempSync, rmSync } from 'node:fs';
+import { existsSync, mkdtempSync, readFileSync, rmSync, writeFileSync } from 'node:fs';
 import { connect, createServer } from 'node:net';
 import { tmpdir } from 'node:os';
 import { join, resolve } from 'node:path';
@@ -10,7 +10,7 @@ import { Browser, sleep, until } from './viewer_browser.mjs';
 
 const build = resolve(process.argv[2] ?? 'build');
 const dir = mkdtempSync(join(tmpdir(), 'viewer-'));
-const TINY = 200 * 1024, PATCHES = 250;
+const TINY = 200 * 1024, PATCHES = 250, TOKEN = 'a-token-of-the-page-0123456789';
 const ours = [];
 
 function start(program, ...words) {
@@ -55,6 +55,14 @@ function command(word) {
 const status = () => command('STATUS');
 const counts = (page) => page.ask('viewer.counts()');
 
+// Into the configuration that `facet simulate` wrote: a token, and a folder for recordings.
+function grantToken() {
+  const config = join(dir, 'facetd.yaml'), file = join(dir, 'token');
+  writeFileSync(file, `${TOKEN}\n`, { mode: 0o600 });
+  writeFileSync(config, readFileSync(config, 'utf8').replace(/^listen: \{/m, `listen: {token_file: "${file}", `) +
+    `record: {dir: "${dir}"}\n`);
+}
+
 let address;
 const startDaemon = async () => {
   const daemon = start('facetd', '--config', join(dir, 'facetd.yaml'));
@@ -78,6 +86,15 @@ async function standStill(patches) {
 const holds = (page, what, { step, generation, map_size: map }) => page.until(what, 40,
   `(({patches, triangles, drawn, step, generation}) => patches === ${map.patches} && triangles === ${map.triangles} &&
     drawn === ${map.triangles} && step === ${step} && generation === ${generation})(viewer.counts())`);
+
+// The camera glides; it stands when three pictures in a row are seen from the same place.
+const standing = (page) => page.until('the camera stands', 40, `new Promise((done) => {
+  const at = () => viewer.camera.current.matrixWorld.elements.join() + viewer.camera.current.projectionMatrix.elements.join();
+  const before = at();
+  let frames = 0;
+  const turn = () => (++frames < 4 ? requestAnimationFrame(turn) : done(before === at()));
+  requestAnimationFrame(turn);
+})`);
 
 // ---- the claims ----
 
@@ -107,10 +124,16 @@ const claims = {
   async 'it shows the map: as many patches and triangles as the daemon says'({ page }) {
     await holds(page, 'the page has the map', await standStill(PATCHES));
     const { patches, triangles } = await counts(page);
-    const first = await page.ask('Math.round(viewer.firstMs)');
-    console.log(`note: ${patches} patches, ${triangles} triangles; first picture ${first} ms after the page was opened`);
+        console.log(`note: ${patches} patches, ${triangles} triangles`);
     await page.until('the panel says so', 10, `document.getElementById('state-text').textContent === 'paused' &&
       document.getElementById('patches').textContent.length > 0`);
+  },
+
+  async 'it opens with a picture'({ browser }) {
+    const page = await browser.open(address);
+    await page.until('a picture', 60, 'viewer.firstMs !== null');
+    console.log(`note: a picture ${await page.ask('Math.round(viewer.firstMs)')} ms after the page was opened, WebGL in software`);
+    await page.close();
   },
 
   async 'a still picture is the same twice, and tells its counts in the title'({ browser }) {
@@ -130,6 +153,7 @@ const claims = {
 
   async 'a click tells point, class, plane and patch'({ page }) {
     await page.ask(`viewer.camera.home()`);
+    await standing(page);
     const { x, y } = await page.until('a place to click', 20, `viewer.somewhere()`);
     await page.click(x, y);
     await page.until('the pick', 10, `!document.getElementById('pick').hidden`);
@@ -141,7 +165,7 @@ const claims = {
 
   async 'two clicks measure what lies between them'({ page }) {
     await page.ask(`document.querySelector('[data-camera=top]').click(); viewer.camera.home(); document.getElementById('measure').click()`);
-    await sleep(1500); // it glides to the plan
+    await standing(page);
     const { x, y } = await page.until('a floor to click', 20, `viewer.somewhere(0.95)`);
     await page.click(x, y);
     await page.until('the first point', 10, `viewer.measure.points.length === 1`);
@@ -160,9 +184,9 @@ const claims = {
       document.getElementById('backs').click()`);
     const clip = { x: 60, y: 80, width: 800, height: 540, scale: 1 };
     const shot = async () => (await page.call('Page.captureScreenshot', { format: 'png', clip })).data;
-    const standing = () => until('the camera stands', 30, async () => (await shot()) === (await shot()));
     const slide = (value) => page.ask(`(s => { s.value = ${value}; s.dispatchEvent(new Event('input')); })(document.getElementById('section'))`);
-    await standing();
+    await standing(page);
+    await until('one picture', 20, async () => (await shot()) === (await shot()));
     const whole = await shot();
     await slide(450);
     await until('pixels change', 20, async () => (await shot()) !== whole);
@@ -175,6 +199,33 @@ const claims = {
   async 'who has no token is offered nothing that changes'({ page }) {
     assert.ok(await page.ask(`document.getElementById('changes').hidden`));
     assert.ok(await page.ask(`document.getElementById('transport').hidden`));
+  },
+
+  async 'who shows the token may pause and record'({ browser }) {
+    const page = await browser.open(`${address}#token=${encodeURIComponent(TOKEN)}`, 640, 400);
+    await page.until('the buttons', 30, `document.getElementById('changes').offsetParent !== null`);
+    assert.equal(await page.ask('location.hash'), '', 'it is out of the address bar');
+    await page.ask(`document.getElementById('pause').click()`);
+    await until('it goes on', 20, async () => !(await status()).paused);
+    await page.until('the button says so', 10, `document.getElementById('pause').getAttribute('aria-pressed') === 'false'`);
+    await page.ask(`document.getElementById('pause').click()`);
+    await until('it pauses', 20, async () => (await status()).paused);
+    for (const wanted of [false, true]) { // `record.dir` is set: it records from the start
+      await page.ask(`document.getElementById('record').click()`);
+      await until(wanted ? 'it records' : 'it ends', 20, async () => (await status()).record.recording === wanted);
+      await page.until('the button says so', 10, `document.getElementById('record').getAttribute('aria-pressed') === '${wanted}'`);
+    }
+    await page.close();
+    await standStill(1);
+  },
+
+  async 'a wrong token is asked for again, and not tried over and over'({ browser }) {
+    const page = await browser.open(`${address}#token=wrong-wrong-wrong-wrong`, 640, 400);
+    await page.until('it asks', 30, `!document.getElementById('ask').hidden`);
+    await sleep(3000);
+    await page.ask(`document.getElementById('token').value = ${JSON.stringify(TOKEN)}; document.getElementById('ask').requestSubmit()`);
+    await page.until('the right one opens', 30, `viewer.counts().patches > 0 && document.getElementById('ask').hidden`);
+    await page.close();
   },
 
   async 'save leads to a snapshot'({ page }) {
@@ -190,7 +241,7 @@ const claims = {
   async 'on a phone all is there, and large enough for a finger'({ browser }) {
     const page = await browser.open(address, 360, 640, true);
     await page.until('the map', 40, 'viewer.map.drawn > 0');
-    const small = await page.ask(`[...document.querySelectorAll('button')].filter((b) => b.offsetParent && !b.closest('[hidden]'))
+    const small = await page.ask(`[...document.querySelectorAll('button')].filter((b) => b.getClientRects().length && getComputedStyle(b).visibility === 'visible')
       .map((b) => [b.id || b.dataset.camera, b.getBoundingClientRect()]).filter(([, r]) => r.width < 40 || r.height < 40 || r.left < 0 || r.right > 360)
       .map(([id, r]) => id + ' ' + r.width + 'x' + r.height + ' at ' + r.left)`);
     assert.deepEqual(small, []);
@@ -228,6 +279,7 @@ async function main() {
   let failures = 0;
   try {
     await until('simulated devices', 30, () => existsSync(join(dir, 'facetd.yaml')));
+    grantToken();
     bed.daemon = await startDaemon();
     bed.browser = new Browser();
     bed.page = await bed.browser.open(address);

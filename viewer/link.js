@@ -5,19 +5,36 @@ const FIRST_MS = 250, LAST_MS = 2000, SILENT_MS = 5000, TOKEN = 'facetd-token';
 // The token of the URL's fragment, which no server log sees; kept for this tab and taken out of the address bar.
 export function takeToken() {
   const given = new URLSearchParams(location.hash.slice(1)).get('token');
+  if (given) {
+    keepToken(given);
+    history.replaceState(null, '', location.pathname + location.search);
+  }
   try {
-    if (given) {
-      sessionStorage.setItem(TOKEN, given);
-      history.replaceState(null, '', location.pathname + location.search);
-    }
     return given ?? sessionStorage.getItem(TOKEN);
   } catch {
     return given; // storage is forbidden
   }
 }
 
+export function keepToken(token) {
+  try {
+    sessionStorage.setItem(TOKEN, token);
+  } catch { /* it lasts as long as the page */ }
+}
+
+// Why a WebSocket was refused, which browsers do not tell: 'token' (one is needed, or this one is wrong), 'wait' (too many
+// wrong ones), or null: something else, or nobody is there.
+export async function askWhy(token) {
+  try {
+    const { status } = await fetch('status.json', { headers: token ? { authorization: `Bearer ${token}` } : {}, cache: 'no-store' });
+    return status === 401 ? 'token' : status === 429 ? 'wait' : null;
+  } catch {
+    return null;
+  }
+}
+
 export class Link {
-  // `hooks`: open(), bytes(Uint8Array), text(string), lost(reason). What they throw ends the connection.
+  // `hooks`: open(), bytes(Uint8Array), text(string), lost(reason, wasOpen). What they throw ends the connection.
   constructor(path, protocols, token, hooks, silentMs = SILENT_MS) {
     Object.assign(this, { path, protocols, token, hooks, silentMs, wait: FIRST_MS, heard: 0, received: 0 });
     this.connect();
@@ -36,7 +53,11 @@ export class Link {
     this.socket = socket;
     this.heard = performance.now();
     socket.binaryType = 'arraybuffer';
-    socket.onopen = () => this.guard(() => this.hooks.open());
+    this.wasOpen = false;
+    socket.onopen = () => {
+      this.wasOpen = true;
+      this.guard(() => this.hooks.open());
+    };
     socket.onmessage = ({ data }) => {
       this.heard = performance.now();
       this.wait = FIRST_MS;
@@ -61,9 +82,23 @@ export class Link {
     socket.onopen = socket.onmessage = socket.onclose = null;
     socket.close();
     this.socket = null;
-    this.hooks.lost(reason);
     this.retry = setTimeout(() => this.connect(), this.wait * (0.8 + 0.2 * Math.random()));
     this.wait = Math.min(this.wait * 2, LAST_MS);
+    this.hooks.lost(reason, this.wasOpen);
+  }
+
+  // Tries no more, until resume().
+  halt() {
+    clearTimeout(this.retry);
+    this.lose('');
+    clearTimeout(this.retry);
+  }
+
+  resume(token) {
+    this.halt();
+    this.token = token;
+    this.wait = FIRST_MS;
+    this.connect();
   }
 
   judge() {
@@ -76,9 +111,7 @@ export class Link {
 
   end() {
     clearInterval(this.watch);
-    clearTimeout(this.retry);
     this.hooks.lost = () => {};
-    this.lose('');
-    clearTimeout(this.retry);
+    this.halt();
   }
 }

@@ -18,6 +18,7 @@ export class Live {
     this.scans = new Map(); // frame -> {ranges, start, step, intensities, at}
     this.base = null; // the robot's pose, where no transform tells it
     this.profiles = 0;
+    this.version = 0; // one more with every message
     this.decoder = new TextDecoder();
     this.link = new Link('/', ['foxglove.sdk.v1'], token, {
       open: () => this.forget(),
@@ -53,6 +54,7 @@ export class Live {
   }
 
   hear(schema, message) {
+    this.version++;
     if (schema === 'foxglove.PoseInFrame') this.base = matrixOf(message.pose.position, message.pose.orientation);
     else if (schema === 'foxglove.FrameTransforms') message.transforms.forEach((transform) => this.frame(transform));
     else this.scan(message);
@@ -93,6 +95,11 @@ export class Live {
       return { frame, place: this.place(frame), tilt: this.tiltOf(frame),
         scan: scan && now - scan.at < STALE_MS ? scan : null };
     });
+  }
+
+  // Scanners whose profile is drawn.
+  get fresh() {
+    return this.scanners().filter(({ scan }) => scan).length;
   }
 
   // The servo's angle, rad, positive looks down: the turn about y of the frame the scanner is mounted in.

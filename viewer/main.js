@@ -4,7 +4,7 @@ import { Camera } from './camera.js';
 import { MODES } from './colours.js';
 import { Grid } from './grid.js';
 import { lengthText } from './length.js';
-import { Link, takeToken } from './link.js';
+import { askWhy, keepToken, Link, takeToken } from './link.js';
 import { Live } from './live.js';
 import { Measure, Picker, tell } from './measure.js';
 import { Mirror } from './mirror.js';
@@ -16,14 +16,14 @@ import { finish, stillCounts } from './still.js';
 import { Transport } from './transport.js';
 
 const query = new URLSearchParams(location.search), still = query.get('still') === '1';
-const STALE_S = 2, CLICK_PIXELS = 5, CLICK_MS = 500;
+const STALE_S = 2, CLICK_PIXELS = 5;
 
 ColorManagement.enabled = false; // display colours throughout: shader.js
 const renderer = new WebGLRenderer({ canvas: $('view'), antialias: true, alpha: true, powerPreference: 'high-performance' });
 renderer.outputColorSpace = LinearSRGBColorSpace;
 renderer.setClearAlpha(0);
 
-const token = takeToken();
+let token = takeToken();
 const scene = new Scene(), map = new MapScene(), grid = new Grid(), robot = new Robot(), measure = new Measure();
 const camera = new Camera($('view'), still), picker = new Picker(map), panel = new Panel();
 scene.add(grid.mesh, map.group, robot.group, measure.group);
@@ -31,24 +31,46 @@ scene.add(grid.mesh, map.group, robot.group, measure.group);
 // ---- what comes ----
 
 const mirror = new Mirror((name, patch, before) => map.show(name, (patch ?? before).key, patch));
-let status = null, may = { change: false, play: false }, lost = null, reader, live = null;
+let status = null, may = { change: false, play: false }, shut = null, reader, live = null;
 
 const hooks = {
   open() {
-    lost = null;
+    $('ask').hidden = true;
+    shut = null;
     mirror.reconnect();
     reader = new FrameReader((type, payload) => take(type, payload));
     link.send(writeWant());
     link.send('?WATCH={"enable":true}');
+    if (!live && !still) live = new Live(token);
   },
   bytes: (bytes) => reader.push(bytes),
   text: (text) => hear(JSON.parse(text)),
-  lost(reason) {
-    lost = reason;
+  lost(reason, wasOpen) {
+    if (!wasOpen) refused();
   },
 };
 const link = new Link('/native', ['facetd.v1'], token, hooks);
-if (!still) live = new Live(token);
+
+// Each try without the right token counts with the daemon as a guess; so it is asked for, and not tried again.
+async function refused() {
+  const why = await askWhy(token);
+  if (!why || link.open) return;
+  shut = why;
+  link.halt();
+  $('ask').hidden = false;
+  $('ask-why').textContent = why === 'wait' ? 'Too many wrong tokens: wait a minute, then try again.'
+    : token ? 'That token is not the one of this robot.' : 'This robot asks for its token.';
+}
+
+function showToken(event) {
+  event.preventDefault();
+  token = $('token').value.trim();
+  keepToken(token);
+  live?.link.end();
+  live = null;
+  $('ask').hidden = true;
+  link.resume(token);
+}
 
 function take(type, payload) {
   const before = mirror.hello;
@@ -146,7 +168,7 @@ function listenForClicks(canvas) {
   });
   canvas.addEventListener('pointerup', (event) => {
     const moved = down ? Math.hypot(event.clientX - down.clientX, event.clientY - down.clientY) : Infinity;
-    if (event.isPrimary && moved < CLICK_PIXELS && event.timeStamp - down.timeStamp < CLICK_MS) pickAt(event.clientX, event.clientY);
+    if (event.isPrimary && moved < CLICK_PIXELS) pickAt(event.clientX, event.clientY);
     down = null;
   });
 }
@@ -169,10 +191,12 @@ const keys = { 1: () => setCamera('free'), 2: () => setCamera('follow'), 3: () =
   ' ': () => (status?.replay ? $('play') : $('pause')).click(), Escape: () => { setMeasuring(false); $('formats').hidden = true; panel.open(false); } };
 
 function wireUp() {
+  for (const what of ['input', 'change', 'click', 'keydown', 'pointerup']) addEventListener(what, () => hand++);
   for (const [id, act] of Object.entries(flip)) $(id).onchange = () => act($(id).checked);
   for (const button of document.querySelectorAll('[data-camera]')) button.onclick = () => setCamera(button.dataset.camera);
   $('mode').onchange = () => setMode($('mode').value);
   $('section').oninput = () => setSection(+$('section').value);
+  $('ask').onsubmit = showToken;
   $('home').onclick = () => { setCamera(camera.mode === 'top' ? 'top' : 'free'); camera.home(); };
   $('measure').onclick = () => setMeasuring(!measuring);
   $('save').onclick = saveMenu;
@@ -197,6 +221,7 @@ function resize() {
   renderer.setPixelRatio(still ? 1 : Math.min(devicePixelRatio, 2));
   renderer.setSize(innerWidth, innerHeight, false);
   const sheet = $('panel').getBoundingClientRect();
+  hand++;
   camera.resize(innerWidth, innerHeight, !still && sheet.width < innerWidth / 2 ? innerWidth - sheet.left : 0);
 }
 
@@ -206,7 +231,8 @@ function tellState(now) {
     if (link.open) pictureAt = link.heard;
   }
   const age = pictureAt === null ? null : (now - pictureAt) / 1000;
-  if (!link.open) panel.state('lost', age === null ? 'no daemon, trying' : `reconnecting, picture is ${span(age)} old`);
+  if (shut) panel.state('lost', 'a token is needed');
+  else if (!link.open) panel.state('lost', age === null ? 'no daemon, trying' : `reconnecting, picture is ${span(age)} old`);
   else if (age === null) panel.state('wait', 'connecting');
   else if (age > STALE_S) panel.state('wait', `picture is ${span(age)} old`);
   else if (status?.paused) panel.state('paused', 'paused');
@@ -238,13 +264,28 @@ function robotTime(now) {
   return status && link.open && !status.replay ? status.t + (now - link.heard) / 1000 : map.latest;
 }
 
+// A picture is made only when it would be another one: a phone's battery lasts, and software rendering is spared.
+const seen = { view: '', live: null, hand: -1, second: -1 };
+let hand = 0; // what a person did, counted
+function isNew(changed, now) {
+  const view = [...camera.current.matrixWorld.elements, ...camera.current.projectionMatrix.elements].join();
+  const next = { view, live: live ? `${live.version} ${live.fresh}` : '', hand, second: MODES[map.mode].id === 'age' ? Math.floor(now / 1000) : 0 };
+  const other = Object.keys(seen).some((key) => seen[key] !== next[key]);
+  Object.assign(seen, next);
+  return changed || other;
+}
+
 function draw(dt, now) {
-  if (map.update(!mirror.batch, camera.current.position, dt) && map.frame.isEmpty()) map.measure(mirror.patches);
+  const changed = map.update(!mirror.batch, camera.current.position, dt);
+  if (changed && map.frame.isEmpty()) map.measure(mirror.patches);
   if (live) robot.update(live);
   const place = live?.robot;
   camera.update(map.frame, map.points, place ? camera.free.position.clone().setFromMatrixPosition(place) : null, dt);
+  camera.current.updateMatrixWorld();
+  if (!isNew(changed, now)) return;
   grid.update(map.frame);
   map.prepare(camera.current.position, still ? map.latest : robotTime(now));
+  showLength();
   renderer.render(scene, camera.current);
   if (firstMs === null && map.drawn) firstMs = performance.now();
 }
@@ -254,7 +295,6 @@ function frame(now) {
   frames++;
   draw(Math.min((now - before) / 1000, 0.25), now);
   before = now;
-  showLength();
   panel.servo(live?.scanners()[0]?.tilt ?? null);
   transport.move();
   tellState(performance.now());
@@ -292,7 +332,7 @@ function somewhere(up = -1, from = 0) {
   }
   return null;
 }
-globalThis.viewer = { somewhere, get firstMs() { return firstMs; }, mirror, map, camera, live, robot, measure,
+globalThis.viewer = { somewhere, get live() { return live; }, get firstMs() { return firstMs; }, mirror, map, camera, robot, measure,
   counts: () => stillCounts(mirror, map), status: () => status };
 if (still) stillFrame();
 else requestAnimationFrame(frame);

@@ -17,139 +17,15 @@
  * everything, which is how a late or restarted reader comes to hold the map and nothing else.
  *
  * A deletion goes for entities older than itself, so its time is later than that of everything that was sent before. */
-#include "daemon/foxglove.h"
+#include "daemon/foxglove_parts.h"
 
 #include <assert.h>
-#include <errno.h>
-#include <jansson.h>
-#include <math.h>
 #include <stdio.h>
 #include <stdlib.h>
 #include <string.h>
 
 #include "daemon/foxglove_messages.h"
 #include "daemon/foxglove_schema.h"
-
-enum { OP_MESSAGE = 1, OP_TIME = 2, OP_ASSET = 4, OP_PLAYBACK = 5 };     /* to the client */
-enum { OP_HEARD_MESSAGE = 1, OP_HEARD_CALL = 2, OP_HEARD_PLAYBACK = 3 }; /* from it */
-enum { LEVEL_INFO, LEVEL_WARNING, LEVEL_ERROR };                         /* of status */
-enum { CHANNEL_MAP, CHANNEL_TF, CHANNEL_POSE, CHANNEL_LOG, CHANNEL_STATUS, CHANNEL_SCANS };
-
-#define CHANNELS_MAX   (CHANNEL_SCANS + CONFIG_DEVICES_MAX)
-#define CHANNEL_ID(at) ((uint32_t)(at) + 1)
-#define TOPIC_MAX      (CONFIG_NAME_MAX + 8)
-#define ANSWER_HEAD    5            /* u32 length, u8 text */
-#define RETRY_NS       1000000000ll /* after memory was out */
-
-struct stream {
-	bool subscribed;
-	uint32_t subscription;
-	uint64_t shown;  /* the sequence number of what was told last */
-	int64_t next_ns; /* not before then */
-};
-
-/* The SceneUpdate that is being said. */
-struct scene {
-	struct publisher_client *walk; /* NULL: the map is not asked for */
-	bool talking, ended, whole;    /* whole: the walk came to its end */
-	bool dismissed;                /* unsubscribed meanwhile: the message ends, then the walk */
-	bool reset, begun, first, entities;
-	bool quiet; /* nothing was new when last asked */
-	uint32_t subscription;
-	const uint8_t *item; /* borrowed of the walk */
-	size_t item_left;
-	int64_t newest_ns; /* no entity that was sent is younger */
-};
-
-struct foxglove_client {
-	struct foxglove *foxglove;
-	struct foxglove_client *next;
-	enum scene_encoding encoding;
-	bool may_play;
-	struct foxglove_wire wire;
-	int64_t joined_ns, told_ns; /* told_ns: the deadline the wire knows of */
-	bool greeted, advertised;
-	struct stream stream[CHANNELS_MAX], time;
-	unsigned turn;
-	struct scene scene;
-	struct buffer answers; /* messages, each behind ANSWER_HEAD bytes */
-	size_t answers_at;
-	struct buffer out; /* of the message that is being said */
-	size_t out_at;
-	bool out_text;
-	struct player_status playback; /* as told */
-	bool playback_told;
-	uint64_t messages, dropped;
-};
-
-struct foxglove {
-	struct publisher *publisher;
-	struct live *live;
-	struct foxglove_host host;
-	struct foxglove_client *clients;
-	int channels;
-	int64_t begun_ns;
-};
-
-/* Bytes */
-
-static void put_u8(struct buffer *b, uint8_t v)
-{
-	buffer_append(b, &v, 1);
-}
-
-static void put_u32(struct buffer *b, uint32_t v)
-{
-	buffer_append(b, &v, 4);
-}
-
-static void put_u64(struct buffer *b, uint64_t v)
-{
-	buffer_append(b, &v, 8);
-}
-
-static void put_text(struct buffer *b, const char *text)
-{
-	buffer_append(b, text, strlen(text));
-}
-
-static uint32_t get_u32(const uint8_t *at)
-{
-	uint32_t v;
-
-	memcpy(&v, at, 4);
-	return v;
-}
-
-/* Of text that is valid UTF-8. */
-static void put_json_string(struct buffer *b, const char *text, size_t len)
-{
-	put_text(b, "\"");
-	for (size_t i = 0; i < len; i++) {
-		if (text[i] == '"' || text[i] == '\\')
-			buffer_printf(b, "\\%c", text[i]);
-		else if ((unsigned char)text[i] < ' ')
-			buffer_printf(b, "\\u%04x", (unsigned)(unsigned char)text[i]);
-		else
-			buffer_append(b, text + i, 1);
-	}
-	put_text(b, "\"");
-}
-
-static void put_base64(struct buffer *b, const uint8_t *data, size_t len)
-{
-	static const char digit[] = "ABCDEFGHIJKLMNOPQRSTUVWXYZabcdefghijklmnopqrstuvwxyz0123456789+/";
-
-	for (size_t i = 0; i < len; i += 3) {
-		const size_t left = len - i;
-		const uint32_t v = (uint32_t)data[i] << 16 | (left > 1 ? (uint32_t)data[i + 1] << 8 : 0) |
-		                   (left > 2 ? data[i + 2] : 0);
-		const char four[4] = {digit[v >> 18], digit[v >> 12 & 63], left > 1 ? digit[v >> 6 & 63] : '=',
-		                      left > 2 ? digit[v & 63] : '='};
-
-		buffer_append(b, four, 4);
-	}
-}
 
 /* Waking */
 
@@ -159,7 +35,7 @@ static int64_t earlier(int64_t a, int64_t b)
 }
 
 /* The wire asks again only when it is told to, or when the time it knows of has come. */
-static void wake(struct foxglove_client *client)
+void foxglove_wake(struct foxglove_client *client)
 {
 	const int64_t deadline_ns = foxglove_deadline(client);
 
@@ -174,63 +50,7 @@ static void on_live(void *ctx)
 	struct foxglove *f = ctx;
 
 	for (struct foxglove_client *client = f->clients; client; client = client->next)
-		wake(client);
-}
-
-/* Answers */
-
-static void answer(struct foxglove_client *client, const void *data, size_t len, bool text)
-{
-	struct buffer *b = &client->answers;
-
-	if (b->len - client->answers_at + len > FOXGLOVE_ANSWERS_MAX || b->error) {
-		client->dropped++;
-		return;
-	}
-	if (client->answers_at > 0) { /* what was said makes room */
-		memmove(b->data, b->data + client->answers_at, b->len - client->answers_at);
-		b->len -= client->answers_at;
-		client->answers_at = 0;
-	}
-	put_u32(b, (uint32_t)len);
-	put_u8(b, text);
-	buffer_append(b, data, len);
-}
-
-static void answer_buffer(struct foxglove_client *client, struct buffer *b, bool text)
-{
-	if (b->error)
-		client->dropped++;
-	else
-		answer(client, b->data, b->len, text);
-	buffer_finish(b);
-}
-
-/* The sentence holds nothing that the client said but words and numbers. */
-static void __attribute__((format(printf, 3, 4)))
-say_status(struct foxglove_client *client, int level, const char *format, ...)
-{
-	struct buffer b = {0};
-	char text[300];
-	va_list arguments;
-
-	va_start(arguments, format);
-	vsnprintf(text, sizeof(text), format, arguments);
-	va_end(arguments);
-	buffer_printf(&b, "{\"op\":\"status\",\"level\":%d,\"message\":", level);
-	put_json_string(&b, text, strlen(text));
-	put_text(&b, "}");
-	answer_buffer(client, &b, true);
-}
-
-/* A word of the client's as it may be repeated: letters of ASCII, else "?". */
-static const char *plain_word(const char *word)
-{
-	size_t n = 0;
-
-	while ((word[n] >= 'a' && word[n] <= 'z') || (word[n] >= 'A' && word[n] <= 'Z'))
-		n++;
-	return word[n] || n == 0 || n > 40 ? "?" : word;
+		foxglove_wake(client);
 }
 
 /* Channels */
@@ -253,6 +73,21 @@ static enum foxglove_schema schema_of(int channel)
 	                                              [CHANNEL_LOG] = FOXGLOVE_LOG};
 
 	return channel >= CHANNEL_SCANS ? FOXGLOVE_LASER_SCAN : schema[channel];
+}
+
+static void put_base64(struct buffer *b, const uint8_t *data, size_t len)
+{
+	static const char digit[] = "ABCDEFGHIJKLMNOPQRSTUVWXYZabcdefghijklmnopqrstuvwxyz0123456789+/";
+
+	for (size_t i = 0; i < len; i += 3) {
+		const size_t left = len - i;
+		const uint32_t v = (uint32_t)data[i] << 16 | (left > 1 ? (uint32_t)data[i + 1] << 8 : 0) |
+		                   (left > 2 ? data[i + 2] : 0);
+		const char four[4] = {digit[v >> 18], digit[v >> 12 & 63], left > 1 ? digit[v >> 6 & 63] : '=',
+		                      left > 2 ? digit[v & 63] : '='};
+
+		buffer_append(b, four, 4);
+	}
 }
 
 static void put_channel(struct buffer *b, const struct foxglove *f, int channel, enum scene_encoding encoding)
@@ -328,417 +163,14 @@ static void put_server_info(struct buffer *b, const struct foxglove_client *clie
 	put_text(b, "}");
 }
 
-/* Playback */
+/* Messages */
 
-static void put_playback(struct buffer *b, const struct player_status *status, bool seeked, const char *name,
-                         size_t len)
-{
-	const float speed = (float)(status->speed > 0 ? status->speed : PLAYER_SPEED_MAX);
-
-	put_u8(b, OP_PLAYBACK);
-	put_u8(b, (uint8_t)status->state);
-	put_u64(b, (uint64_t)status->now_ns);
-	buffer_append(b, &speed, 4);
-	put_u8(b, seeked);
-	put_u32(b, (uint32_t)len);
-	buffer_append(b, name, len);
-}
-
-static void tell_playback(struct foxglove_client *client, const char *name, size_t len)
-{
-	const struct foxglove_host *host = &client->foxglove->host;
-	struct player_status status;
-	struct buffer b = {0};
-
-	host->playback(host->ctx, &status);
-	put_playback(&b, &status, client->playback_told && status.seeks != client->playback.seeks, name, len);
-	answer_buffer(client, &b, false);
-	client->playback = status;
-	client->playback_told = true;
-}
-
-static void look_at_playback(struct foxglove_client *client)
-{
-	const struct foxglove_host *host = &client->foxglove->host;
-	const struct player_status *told = &client->playback;
-	struct player_status status;
-
-	if (!host->playback)
-		return;
-	host->playback(host->ctx, &status);
-	if (!client->playback_told || status.state != told->state || status.seeks != told->seeks ||
-	    status.speed < told->speed || status.speed > told->speed)
-		tell_playback(client, "", 0);
-}
-
-static void hear_playback(struct foxglove_client *client, const uint8_t *data, size_t len)
-{
-	const struct foxglove_host *host = &client->foxglove->host;
-	struct foxglove_request request;
-	char error[200] = "";
-	float speed;
-	uint32_t name_len;
-	int64_t seek_ns;
-
-	if (len < 19 || (name_len = get_u32(data + 15)) > len - 19 || name_len > FOXGLOVE_REQUEST_MAX || data[1] > 1) {
-		say_status(client, LEVEL_ERROR, "this playback request cannot be read");
-		return;
-	}
-	memcpy(&speed, data + 2, 4);
-	memcpy(&seek_ns, data + 7, 8);
-	request = (struct foxglove_request){.play = data[1] == 0, .speed = speed, .seek = data[6], .seek_ns = seek_ns};
-	if (!host->play)
-		say_status(client, LEVEL_ERROR, "nothing is replayed here: playback cannot be controlled");
-	else if (!client->may_play)
-		say_status(client, LEVEL_ERROR,
-		           "playback is controlled from this machine, or with the token in the address (?token=...)");
-	else if (!isfinite(speed) || speed <= 0)
-		say_status(client, LEVEL_ERROR, "a speed of playback is a number above 0");
-	else if (!host->play(host->ctx, &request, error))
-		say_status(client, LEVEL_ERROR, "%s", error);
-	if (host->playback)
-		tell_playback(client, (const char *)data + 19, name_len);
-}
-
-/* What clients say */
-
-static void leave_map(struct foxglove_client *client)
-{
-	if (client->scene.walk)
-		publisher_leave(client->scene.walk);
-	client->scene.walk = NULL;
-}
-
-static int channel_of(const struct foxglove *f, json_int_t id)
-{
-	return id >= 1 && id <= f->channels ? (int)id - 1 : -1;
-}
-
-static struct stream *find_subscription(struct foxglove_client *client, uint32_t subscription)
-{
-	for (int i = 0; i < CHANNELS_MAX; i++)
-		if (client->stream[i].subscribed && client->stream[i].subscription == subscription)
-			return &client->stream[i];
-	return NULL;
-}
-
-static void subscribe_one(struct foxglove_client *client, const json_t *one)
-{
-	const json_t *id = json_object_get(one, "id"), *channel_id = json_object_get(one, "channelId");
-	const json_int_t number = json_integer_value(id);
-	int channel;
-
-	if (!json_is_integer(id) || !json_is_integer(channel_id) || number < 0 || number > UINT32_MAX) {
-		say_status(client, LEVEL_ERROR, "a subscription has an `id` (0 .. 4294967295) and a `channelId`");
-		return;
-	}
-	channel = channel_of(client->foxglove, json_integer_value(channel_id));
-	if (channel < 0) {
-		say_status(client, LEVEL_ERROR, "channel %" JSON_INTEGER_FORMAT " does not exist",
-		           json_integer_value(channel_id));
-	} else if (client->stream[channel].subscribed) {
-		say_status(client, LEVEL_WARNING, "channel %d is subscribed already (as %u)", channel + 1,
-		           client->stream[channel].subscription);
-	} else if (find_subscription(client, (uint32_t)number)) {
-		say_status(client, LEVEL_ERROR, "subscription %" JSON_INTEGER_FORMAT " is another one's id", number);
-	} else {
-		const uint64_t lines = live_lines(client->foxglove->live);
-
-		client->stream[channel] = (struct stream){.subscribed = true, .subscription = (uint32_t)number};
-		client->scene.quiet &= channel != CHANNEL_MAP;
-		if (channel == CHANNEL_LOG && lines > LIVE_LINES) /* those that are kept come first */
-			client->stream[channel].shown = lines - LIVE_LINES;
-	}
-}
-
-static void unsubscribe_one(struct foxglove_client *client, const json_t *id)
-{
-	const json_int_t number = json_integer_value(id);
-	struct stream *stream = json_is_integer(id) && number >= 0 && number <= UINT32_MAX
-	                            ? find_subscription(client, (uint32_t)number)
-	                            : NULL;
-
-	if (!stream) {
-		say_status(client, LEVEL_WARNING, "there is no such subscription");
-		return;
-	}
-	stream->subscribed = false;
-	if (stream != &client->stream[CHANNEL_MAP])
-		return;
-	client->scene.dismissed = client->scene.talking;
-	if (!client->scene.talking)
-		leave_map(client);
-}
-
-static void hear_list(struct foxglove_client *client, const json_t *message, const char *key,
-                      void (*one)(struct foxglove_client *, const json_t *))
-{
-	const json_t *list = json_object_get(message, key);
-
-	if (!json_is_array(list)) {
-		say_status(client, LEVEL_ERROR, "`%s` is missing, or is no list", key);
-		return;
-	}
-	for (size_t i = 0; i < json_array_size(list); i++)
-		one(client, json_array_get(list, i));
-}
-
-static void hear_fetch(struct foxglove_client *client, const json_t *message)
-{
-	static const char reason[] = "facetd has no assets";
-	struct buffer b = {0};
-
-	put_u8(&b, OP_ASSET);
-	put_u32(&b, (uint32_t)json_integer_value(json_object_get(message, "requestId")));
-	put_u8(&b, 1);
-	put_u32(&b, sizeof(reason) - 1);
-	put_text(&b, reason);
-	answer_buffer(client, &b, false);
-}
-
-/* What servers may offer and this one does not. */
-static bool is_foreign(const char *op)
-{
-	static const char *const ops[] = {"advertise",
-	                                  "unadvertise",
-	                                  "getParameters",
-	                                  "setParameters",
-	                                  "subscribeParameterUpdates",
-	                                  "unsubscribeParameterUpdates",
-	                                  "subscribeConnectionGraph",
-	                                  "unsubscribeConnectionGraph"};
-
-	for (size_t i = 0; i < sizeof(ops) / sizeof(ops[0]); i++)
-		if (strcmp(op, ops[i]) == 0)
-			return true;
-	return false;
-}
-
-static void hear_text(struct foxglove_client *client, const char *text, size_t len)
-{
-	json_error_t error;
-	json_t *message = json_loadb(text, len, JSON_REJECT_DUPLICATES, &error);
-	const char *op = json_string_value(json_object_get(message, "op"));
-
-	if (!op)
-		say_status(client, LEVEL_ERROR, "this is no message: a JSON object with an `op` is one");
-	else if (strcmp(op, "subscribe") == 0)
-		hear_list(client, message, "subscriptions", subscribe_one);
-	else if (strcmp(op, "unsubscribe") == 0)
-		hear_list(client, message, "subscriptionIds", unsubscribe_one);
-	else if (strcmp(op, "fetchAsset") == 0)
-		hear_fetch(client, message);
-	else if (is_foreign(op))
-		say_status(client, LEVEL_WARNING, "facetd only tells: it takes no `%s`", op);
-	else
-		say_status(client, LEVEL_ERROR, "`%s` is not an operation that facetd knows", plain_word(op));
-	json_decref(message);
-}
-
-static void hear_call(struct foxglove_client *client, const uint8_t *data, size_t len)
-{
-	struct buffer b = {0};
-
-	if (len < 9) {
-		say_status(client, LEVEL_ERROR, "this call of a service cannot be read");
-		return;
-	}
-	buffer_printf(&b,
-	              "{\"op\":\"serviceCallFailure\",\"serviceId\":%u,\"callId\":%u,"
-	              "\"message\":\"facetd offers no services\"}",
-	              get_u32(data + 1), get_u32(data + 5));
-	answer_buffer(client, &b, true);
-}
-
-static void hear_binary(struct foxglove_client *client, const uint8_t *data, size_t len)
-{
-	const int op = len > 0 ? data[0] : 0;
-
-	if (op == OP_HEARD_MESSAGE)
-		say_status(client, LEVEL_WARNING, "facetd only tells: it takes no messages");
-	else if (op == OP_HEARD_CALL)
-		hear_call(client, data, len);
-	else if (op == OP_HEARD_PLAYBACK)
-		hear_playback(client, data, len);
-	else
-		say_status(client, LEVEL_ERROR, "%d begins no message that facetd knows", op);
-}
-
-void foxglove_hear(struct foxglove_client *client, const uint8_t *data, size_t len, bool text)
-{
-	if (text)
-		hear_text(client, (const char *)data, len);
-	else
-		hear_binary(client, data, len);
-	wake(client);
-}
-
-/* The map */
-
-static void begin_message(struct foxglove_client *client, uint32_t subscription, int64_t time_ns)
+void foxglove_begin_message(struct foxglove_client *client, uint32_t subscription, int64_t time_ns)
 {
 	put_u8(&client->out, OP_MESSAGE);
 	put_u32(&client->out, subscription);
 	put_u64(&client->out, (uint64_t)time_ns);
 }
-
-static void put_deletion(struct foxglove_client *client, bool all, struct patch_key key)
-{
-	struct scene *scene = &client->scene;
-	const struct scene_deletion deletion = {.t_ns = scene->newest_ns + 1, .all = all, .key = key};
-
-	if (!scene->first && client->encoding == SCENE_AS_JSON)
-		put_text(&client->out, ",");
-	scene->first = false;
-	scene_put_deletion(&client->out, client->encoding, &deletion);
-}
-
-static void begin_scene(struct foxglove_client *client)
-{
-	const struct foxglove_host *host = &client->foxglove->host;
-	struct scene *scene = &client->scene;
-	const int64_t time_ns = host->time(host->ctx);
-
-	scene->newest_ns = time_ns > scene->newest_ns ? time_ns : scene->newest_ns;
-	scene->begun = scene->first = true;
-	begin_message(client, scene->subscription, time_ns);
-	if (client->encoding == SCENE_AS_JSON)
-		put_text(&client->out, SCENE_JSON_BEGIN);
-	if (scene->reset)
-		put_deletion(client, true, (struct patch_key){0});
-}
-
-static void put_entity(struct foxglove_client *client, const struct publisher_item *item)
-{
-	struct scene *scene = &client->scene;
-
-	if (client->encoding == SCENE_AS_JSON)
-		put_text(&client->out, scene->entities ? "," : SCENE_JSON_MIDDLE);
-	scene->entities = true;
-	scene->item = item->bytes;
-	scene->item_left = item->len;
-	if (item->t_last_ns > scene->newest_ns)
-		scene->newest_ns = item->t_last_ns;
-}
-
-static void end_scene(struct foxglove_client *client)
-{
-	struct scene *scene = &client->scene;
-
-	scene->ended = true;
-	if (client->encoding == SCENE_AS_JSON) {
-		if (!scene->entities)
-			put_text(&client->out, SCENE_JSON_MIDDLE);
-		put_text(&client->out, SCENE_JSON_END);
-	}
-}
-
-/* A little more of the message: into `out`, or as an item. */
-static void scene_step(struct foxglove_client *client)
-{
-	struct scene *scene = &client->scene;
-	struct publisher_item item;
-	int r;
-
-	client->out.len = client->out_at = 0;
-	if (!scene->begun) {
-		begin_scene(client);
-		return;
-	}
-	r = scene->dismissed ? -ECANCELED : publisher_walk_next(scene->walk, &item);
-	if (r == 1 && item.removed) {
-		assert(!scene->entities);
-		put_deletion(client, false, item.key);
-	} else if (r == 1) {
-		put_entity(client, &item);
-	} else {
-		scene->whole = r == 0;
-		end_scene(client);
-	}
-}
-
-static bool scene_pends(const struct foxglove_client *client)
-{
-	return client->out_at < client->out.len || client->scene.item_left > 0;
-}
-
-static size_t scene_copy(struct foxglove_client *client, uint8_t *buf, size_t cap)
-{
-	struct scene *scene = &client->scene;
-	const size_t left = client->out.len - client->out_at;
-	size_t n;
-
-	if (left > 0) {
-		n = left < cap ? left : cap;
-		memcpy(buf, client->out.data + client->out_at, n);
-		client->out_at += n;
-		return n;
-	}
-	n = scene->item_left < cap ? scene->item_left : cap;
-	memcpy(buf, scene->item, n);
-	scene->item += n;
-	scene->item_left -= n;
-	return n;
-}
-
-/* The message was said to its end. */
-static void scene_said(struct foxglove_client *client, int64_t t_ns)
-{
-	struct scene *scene = &client->scene;
-	const bool broken = client->out.error != 0;
-
-	scene->talking = false;
-	if (broken)
-		buffer_finish(&client->out);
-	if (scene->whole && !broken)
-		publisher_walk_commit(scene->walk);
-	client->messages++;
-	client->stream[CHANNEL_MAP].next_ns = t_ns + (broken ? RETRY_NS : FOXGLOVE_MAP_NS);
-	if (scene->dismissed)
-		leave_map(client);
-	scene->dismissed = false;
-}
-
-static size_t scene_next(struct foxglove_client *client, uint8_t *buf, size_t cap, int64_t t_ns, bool *ret_final)
-{
-	size_t n = 0;
-
-	for (;;) {
-		while (!scene_pends(client) && !client->scene.ended)
-			scene_step(client);
-		if (!scene_pends(client) || n == cap)
-			break;
-		n += scene_copy(client, buf + n, cap - n);
-	}
-	*ret_final = !scene_pends(client);
-	if (*ret_final)
-		scene_said(client, t_ns);
-	return n;
-}
-
-/* True: a message is begun. */
-static bool scene_begin(struct foxglove_client *client)
-{
-	struct scene *scene = &client->scene;
-	struct native_want want = {0};
-	struct native_begin begin;
-
-	if (!scene->walk)
-		scene->walk = publisher_join_walk(client->foxglove->publisher, &want,
-		                                  client->encoding == SCENE_AS_JSON ? PUBLISHER_SCENE_JSON
-		                                                                    : PUBLISHER_SCENE_PROTOBUF);
-	scene->quiet = !scene->walk || publisher_walk_begin(scene->walk, &begin) != 1;
-	if (scene->quiet)
-		return false;
-	scene->talking = true;
-	scene->reset = begin.reset;
-	scene->begun = scene->ended = scene->whole = scene->entities = false;
-	scene->subscription = client->stream[CHANNEL_MAP].subscription;
-	scene->item_left = 0;
-	return true;
-}
-
-/* The other channels */
 
 /* Of channels that follow what is measured: its number now. */
 static uint64_t sequence_of(const struct foxglove_client *client, int channel)
@@ -816,7 +248,7 @@ static void put_message(struct foxglove_client *client, int channel, int64_t t_n
 	const int64_t time_ns = host->time(host->ctx);
 
 	client->out_text = false;
-	begin_message(client, stream->subscription, time_ns);
+	foxglove_begin_message(client, stream->subscription, time_ns);
 	if (channel == CHANNEL_LOG)
 		put_log(client, stream);
 	else if (channel == CHANNEL_STATUS)
@@ -905,7 +337,7 @@ static bool say_channel(struct foxglove_client *client, int64_t t_ns)
 			continue;
 		if (channel != CHANNEL_MAP && !has_news(client, (int)channel))
 			continue;
-		if (channel == CHANNEL_MAP && !scene_begin(client))
+		if (channel == CHANNEL_MAP && !foxglove_map_begin(client))
 			continue;
 		client->turn = channel + 1;
 		if (channel != CHANNEL_MAP)
@@ -924,7 +356,7 @@ static bool say_something(struct foxglove_client *client, int64_t t_ns)
 	if (client->out.cap > FOXGLOVE_ANSWERS_MAX * 4) /* the greeting was long, and once */
 		buffer_finish(&client->out);
 	if (t_ns >= client->time.next_ns)
-		look_at_playback(client);
+		foxglove_look_at_playback(client);
 	return say_answer(client) || say_time(client, t_ns) || say_channel(client, t_ns);
 }
 
@@ -945,7 +377,7 @@ size_t foxglove_next(struct foxglove_client *client, uint8_t *buf, size_t cap, i
 	}
 	*ret_text = !client->scene.talking && client->out_text;
 	if (client->scene.talking) {
-		n = scene_next(client, buf, cap, t_ns, ret_final);
+		n = foxglove_map_next(client, buf, cap, t_ns, ret_final);
 	} else if (client->out.error) { /* memory is out: this one is not said */
 		buffer_finish(&client->out);
 		client->out_at = 0;
@@ -1019,7 +451,7 @@ void foxglove_leave(struct foxglove_client *client)
 	while (*link != client)
 		link = &(*link)->next;
 	*link = client->next;
-	leave_map(client);
+	foxglove_map_leave(client);
 	buffer_finish(&client->out);
 	buffer_finish(&client->answers);
 	free(client);

@@ -380,6 +380,27 @@ static void a_telegram_sent_twice_is_one_profile(void **state)
 	assert_int_equal(rig->profiles, 3);
 }
 
+static void remission_is_kept_where_the_device_sends_as_much_of_it(void **state)
+{
+	struct rig *rig = *state;
+	struct cola_scan s = telegram_tim();
+
+	feed_scan(rig, &s, 1000, 1);
+	assert_false(rig->last.has_remission);
+	s.channels = 2;
+	s.channel[1] = s.channel[0];
+	memcpy(s.channel[1].name, "RSSI1", 5);
+	next_scan(rig, &s, 1);
+	feed_scan(rig, &s, 1000, 1);
+	assert_true(rig->last.has_remission);
+	assert_true(rig->last.remission[270] > rig->last.remission[0]);
+	s.channel[1].n = 100;
+	next_scan(rig, &s, 1);
+	feed_scan(rig, &s, 1000, 1);
+	assert_int_equal(rig->profiles, 3);
+	assert_false(rig->last.has_remission);
+}
+
 static void what_cannot_be_a_profile_is_counted_and_dropped(void **state)
 {
 	struct rig *rig = *state;
@@ -627,6 +648,7 @@ int main(void)
 	    RIGGED(gaps_in_the_count_of_scans_are_lost_scans),
 	    RIGGED(every_nth_scan_is_no_loss_and_the_first_gap_is_told_in_hindsight),
 	    RIGGED(a_telegram_sent_twice_is_one_profile),
+	    RIGGED(remission_is_kept_where_the_device_sends_as_much_of_it),
 	    RIGGED(what_cannot_be_a_profile_is_counted_and_dropped),
 	    RIGGED(a_rate_or_stamp_beyond_belief_is_counted_and_the_last_one_kept),
 	    RIGGED(encoder_ticks_are_the_tilt_when_the_scan_was_stamped),

@@ -683,6 +683,39 @@ static void error_codes_become_states_by_the_mode(void **state)
 	}
 }
 
+/* Levels stand above the range in some modes; a C4 has amplitudes of some beams behind its ranges. */
+static void remission_is_kept_where_the_scanner_sends_it(void **state)
+{
+	struct rig *rig = *state;
+	static const int modes[] = {0x01, 0x03, 0x05};
+	uint8_t words[2 * 181] = {0}, bytes[LMS2XX_TELEGRAM_MAX];
+	uint8_t c4[3 + 2 * 181 + 6 + 3 + 1] = {LMS2XX_SCAN_REFLECTIVITY, 181, 0x40};
+	const struct lms2xx_scan scan = {.command = LMS2XX_SCAN, .unit = 1, .n = 181, .stride = 2, .value = words};
+
+	for (int m = 0; m < 3; m++) {
+		const int bits = 13 + m;
+
+		words[2 * 7] = 100;
+		words[2 * 7 + 1] = 0xff & ~((1 << (bits - 8)) - 1);
+		tell_mode(rig, modes[m]);
+		feed(rig, FROM_DEVICE, bytes, lms2xx_encode_scan(&scan, bytes));
+		assert_true(rig->last.has_remission);
+		assert_int_equal(rig->last.remission[6], 0);
+		assert_int_equal(rig->last.remission[7], (1 << (16 - bits)) - 1);
+		assert_float_equal(rig->last.range_m[7], 0.1, 1e-6);
+	}
+	tell_mode(rig, 0x06);
+	feed(rig, FROM_DEVICE, bytes, lms2xx_encode_scan(&scan, bytes));
+	assert_false(rig->last.has_remission);
+	memcpy(c4 + 3 + 2 * 181, (uint8_t[]){3, 0, 11, 0, 13, 0, 50, 51, 52, 0x10}, 10);
+	feed_payload(rig, c4, sizeof(c4));
+	assert_true(rig->last.has_remission);
+	assert_int_equal(rig->last.remission[9], 0);
+	assert_int_equal(rig->last.remission[10], 50);
+	assert_int_equal(rig->last.remission[12], 52);
+	assert_int_equal(rig->last.remission[13], 0);
+}
+
 int main(void)
 {
 #define RIGGED(name) cmocka_unit_test_setup_teardown(name, setup, teardown)
@@ -711,6 +744,7 @@ int main(void)
 	    RIGGED(a_broken_snapshot_leaves_the_decoder_as_new),
 	    RIGGED(what_the_device_says_of_itself_is_counted),
 	    RIGGED(error_codes_become_states_by_the_mode),
+	    RIGGED(remission_is_kept_where_the_scanner_sends_it),
 	};
 	return cmocka_run_group_tests(tests, NULL, NULL);
 }

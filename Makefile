@@ -50,6 +50,8 @@ CFLAGS_ALL := -std=c17 -D_GNU_SOURCE -I. -I$(B)/gen -MMD -MP -Wall -Wextra -Wsha
 LDFLAGS_ALL := -pthread $(FLAGS_$(config)) $(LDFLAGS)
 LIBS := $(shell pkg-config --libs $(PACKAGES) 2>/dev/null) -lm
 
+comma := ,
+LIBFACET_ABI := 0
 VERSION := $(shell cat VERSION 2>/dev/null || echo 0)
 
 objects = $(patsubst %.c,$(B)/obj/%.o,$(1))
@@ -67,7 +69,7 @@ LIBRARIES := $(B)/libtools.a $(B)/libdaemon.a $(B)/libdrivers.a $(B)/libconfig.a
 
 .SECONDARY:
 .PHONY: all tests check check-systemd check-vm check-vm-systemd demo bench soak fuzz lint format deps install clean help run-check run-demo needed
-all: needed $(B)/facetd $(B)/facet
+all: needed $(B)/facetd $(B)/facet $(B)/libfacet.so.$(LIBFACET_ABI) $(B)/libfacet.a
 tests: needed $(addprefix $(B)/tests/,$(TESTS) $(PROGRAMS))
 
 help:
@@ -97,6 +99,21 @@ $(B)/lib%.a:
 	@mkdir -p $(@D)
 	@rm -f $@
 	$(Q)ar rcs $@ $^
+
+# libfacet: what a client needs of the core, without a name of ours but facet_*.
+LIBFACET := $(wildcard tools/libfacet*.c) config/address.c $(addprefix core/,native.c coded.c coded_table.c patch.c model.c sha256.c)
+$(B)/pic/%.o: %.c Makefile | needed
+	@mkdir -p $(@D)
+	@echo '  CC   $< (libfacet)'
+	$(Q)$(CC) $(CFLAGS_ALL) -fPIC -fvisibility=hidden -c -o $@ $<
+$(B)/libfacet.so.$(LIBFACET_ABI): $(patsubst %.c,$(B)/pic/%.o,$(LIBFACET))
+	@echo '  LD   $@'
+	$(Q)$(CC) $(LDFLAGS_ALL) -shared -Wl,-soname,$(@F) $(if $(filter release debug,$(config)),-Wl$(comma)--no-undefined) -o $@ $^ -lzstd -lm
+$(B)/libfacet.a: $(patsubst %.c,$(B)/pic/%.o,$(LIBFACET))
+	@rm -f $@
+	$(Q)ld -r -o $(B)/pic/libfacet.o $^
+	$(Q)objcopy --localize-hidden $(B)/pic/libfacet.o
+	$(Q)ar rcs $@ $(B)/pic/libfacet.o
 
 $(B)/facetd: $(B)/obj/daemon/facetd.o $(filter-out $(B)/libtools.a,$(LIBRARIES))
 	@echo '  LD   $@'
@@ -189,6 +206,12 @@ install: all
 	install -d $(DESTDIR)$(PREFIX)/bin $(DESTDIR)$(PREFIX)/lib/systemd/system $(DESTDIR)$(PREFIX)/lib/sysusers.d \
 		$(DESTDIR)$(PREFIX)/lib/udev/rules.d $(DESTDIR)$(PREFIX)/share/doc/facetd
 	install -m 755 $(B)/facetd $(B)/facet $(DESTDIR)$(PREFIX)/bin
+	install -d $(DESTDIR)$(PREFIX)/include $(DESTDIR)$(PREFIX)/lib/pkgconfig
+	install -m 644 tools/facet.h $(DESTDIR)$(PREFIX)/include/facet.h
+	install -m 644 $(B)/libfacet.a $(DESTDIR)$(PREFIX)/lib/libfacet.a
+	install -m 755 $(B)/libfacet.so.$(LIBFACET_ABI) $(DESTDIR)$(PREFIX)/lib/libfacet.so.$(LIBFACET_ABI)
+	ln -sf libfacet.so.$(LIBFACET_ABI) $(DESTDIR)$(PREFIX)/lib/libfacet.so
+	sed 's|@PREFIX@|$(PREFIX)|g; s|@VERSION@|$(VERSION)|g' tools/libfacet.pc.in > $(DESTDIR)$(PREFIX)/lib/pkgconfig/libfacet.pc
 	sed 's|@PREFIX@|$(PREFIX)|g' systemd/facetd.service.in > $(DESTDIR)$(PREFIX)/lib/systemd/system/facetd.service
 	sed 's|@PREFIX@|$(PREFIX)|g' systemd/facetd.socket.in > $(DESTDIR)$(PREFIX)/lib/systemd/system/facetd.socket
 	install -m 644 systemd/70-facetd.rules $(DESTDIR)$(PREFIX)/lib/udev/rules.d/70-facetd.rules
@@ -199,4 +222,4 @@ install: all
 clean:
 	rm -rf build demo
 
--include $(shell find $(B)/obj -name '*.d' 2>/dev/null)
+-include $(shell find $(B)/obj $(B)/pic -name '*.d' 2>/dev/null)

@@ -309,17 +309,6 @@ void grid_mark_changed(struct grid *grid, struct block_key key, const uint8_t la
 			}
 }
 
-int patch_key_compare(struct patch_key a, struct patch_key b)
-{
-	if (a.z != b.z)
-		return a.z < b.z ? -1 : 1;
-	if (a.y != b.y)
-		return a.y < b.y ? -1 : 1;
-	if (a.x != b.x)
-		return a.x < b.x ? -1 : 1;
-	return 0;
-}
-
 static int compare_dirty(const void *a, const void *b)
 {
 	return patch_key_compare(*(const struct patch_key *)a, *(const struct patch_key *)b);

@@ -620,6 +620,9 @@ struct native_mirror {
 	struct patch **pending;
 	size_t pending_n, pending_cap;
 	uint32_t pending_patches;
+	/* The last batch that went in: removals first, references of its own. */
+	struct patch **committed;
+	size_t committed_n, committed_removals;
 };
 
 struct native_mirror *native_mirror_create(void)
@@ -645,11 +648,21 @@ static void forget_batch(struct native_mirror *mirror)
 	mirror->in_batch = false;
 }
 
+static void forget_committed(struct native_mirror *mirror)
+{
+	for (size_t i = 0; i < mirror->committed_n; i++)
+		patch_unref(mirror->committed[i]);
+	free(mirror->committed);
+	mirror->committed = NULL;
+	mirror->committed_n = mirror->committed_removals = 0;
+}
+
 void native_mirror_destroy(struct native_mirror *mirror)
 {
 	if (!mirror)
 		return;
 	forget_batch(mirror);
+	forget_committed(mirror);
 	free(mirror->pending);
 	patch_store_destroy(mirror->patches);
 	free(mirror);
@@ -737,6 +750,24 @@ static int apply_remove(struct native_mirror *mirror, struct patch_key key, char
 	return pend(mirror, tombstone, error);
 }
 
+/* References to the batch, removals first. */
+static int keep_committed(struct native_mirror *mirror)
+{
+	struct patch **kept = malloc((mirror->pending_n + 1) * sizeof(*kept));
+	const size_t removals = mirror->pending_n - mirror->pending_patches;
+	size_t gone = 0, there = removals;
+
+	if (!kept)
+		return -ENOMEM;
+	for (size_t i = 0; i < mirror->pending_n; i++)
+		kept[mirror->pending[i]->nt ? there++ : gone++] = patch_ref(mirror->pending[i]);
+	forget_committed(mirror);
+	mirror->committed = kept;
+	mirror->committed_n = mirror->pending_n;
+	mirror->committed_removals = removals;
+	return 0;
+}
+
 static int apply_commit(struct native_mirror *mirror, uint64_t step, char error[128])
 {
 	const struct native_begin *begin = &mirror->begin;
@@ -746,6 +777,10 @@ static int apply_commit(struct native_mirror *mirror, uint64_t step, char error[
 		return refuse(error, "a COMMIT of another step than the batch's");
 	if (mirror->pending_patches != begin->patches || mirror->pending_n != (size_t)begin->patches + begin->removals)
 		return refuse(error, "a COMMIT before everything announced has come");
+	if (keep_committed(mirror) < 0) {
+		refuse(error, "no memory for the map");
+		return -ENOMEM;
+	}
 	if (begin->reset) {
 		struct patch_store *fresh = patch_store_create();
 
@@ -826,4 +861,26 @@ const struct native_hello *native_mirror_hello(const struct native_mirror *mirro
 uint64_t native_mirror_step(const struct native_mirror *mirror)
 {
 	return mirror->step;
+}
+
+struct patch *const *native_mirror_changed(const struct native_mirror *mirror, size_t *ret_n)
+{
+	*ret_n = mirror->committed_n - mirror->committed_removals;
+	return mirror->committed_n ? mirror->committed + mirror->committed_removals : NULL;
+}
+
+struct patch *const *native_mirror_removed(const struct native_mirror *mirror, size_t *ret_n)
+{
+	*ret_n = mirror->committed_removals;
+	return mirror->committed;
+}
+
+bool native_mirror_was_reset(const struct native_mirror *mirror)
+{
+	return mirror->begin.reset;
+}
+
+void native_mirror_lost(struct native_mirror *mirror)
+{
+	forget_batch(mirror);
 }

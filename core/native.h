@@ -142,4 +142,11 @@ const struct patch_store *native_mirror_patches(const struct native_mirror *);
 const struct native_hello *native_mirror_hello(const struct native_mirror *); /* NULL before HELLO */
 uint64_t native_mirror_step(const struct native_mirror *);
 
+/* What the last COMMIT brought: patches, and the keys of those that are gone (as tombstones). Borrowed until the next one. */
+struct patch *const *native_mirror_changed(const struct native_mirror *, size_t *ret_n);
+struct patch *const *native_mirror_removed(const struct native_mirror *, size_t *ret_n);
+bool native_mirror_was_reset(const struct native_mirror *); /* ... and everything else is gone */
+/* The connection broke: half a batch is forgotten, the map stays until another HELLO and a batch with `reset`. */
+void native_mirror_lost(struct native_mirror *);
+
 #endif

@@ -56,6 +56,17 @@ static void rotate_triangle(const uint32_t from[3], uint32_t to[3])
 		to[c] = from[(first + c) % 3];
 }
 
+int patch_key_compare(struct patch_key a, struct patch_key b)
+{
+	if (a.z != b.z)
+		return a.z < b.z ? -1 : 1;
+	if (a.y != b.y)
+		return a.y < b.y ? -1 : 1;
+	if (a.x != b.x)
+		return a.x < b.x ? -1 : 1;
+	return 0;
+}
+
 size_t patch_bytes(const struct patch *patch)
 {
 	return sizeof *patch + patch->nt * sizeof *patch->triangle + patch->nruns * sizeof *patch->run +

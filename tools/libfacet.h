@@ -1,0 +1,17 @@
+/* What facet's own tools ask of libfacet beyond facet.h. */
+#ifndef FACET_TOOLS_LIBFACET_H
+#define FACET_TOOLS_LIBFACET_H
+
+#include "core/native.h"
+#include "tools/facet.h"
+
+#define LIBFACET_LINE_MAX (1u << 20) /* bytes of a JSON line; a longer one is refused */
+
+int libfacet_want(struct facet *, const struct native_want *);
+const struct native_mirror *libfacet_mirror(const struct facet *);
+
+/* A connected descriptor that does not block, or -errno; waits at most `timeout_ms`. */
+struct address;
+int libfacet_connect(const struct address *, int timeout_ms);
+
+#endif

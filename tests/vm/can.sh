@@ -219,7 +219,7 @@ sdo_write() {
 statusword() {
     : >$scratch/dump
     cansend can0 605#4041600000000000
-    until_true 5 grep -q ' 585#4B416000' $scratch/dump || fail "the drive does not tell its status word"
+    until_true 30 grep -q ' 585#4B416000' $scratch/dump || fail "the drive does not tell its status word"
     sed -n 's/.* 585#4B416000\(..\)\(..\).*/\2\1/p' $scratch/dump | tail -n 1
 }
 # state_is MASK VALUE: of the status word, as in CiA 402.
@@ -228,12 +228,12 @@ state_is() {
 }
 step_to() { # CONTROLWORD_LOW_FIRST MASK VALUE NAME
     sdo_write 2B406000$1"0000"
-    until_true 5 state_is "$2" "$3" || fail "not '$4' after control word $1, but $(statusword)"
+    until_true 30 state_is "$2" "$3" || fail "not '$4' after control word $1, but $(statusword)"
 }
 position_deg() {
     : >$scratch/dump
     cansend can0 605#4064600000000000
-    until_true 5 grep -q ' 585#43646000' $scratch/dump || fail "the drive does not tell its position"
+    until_true 30 grep -q ' 585#43646000' $scratch/dump || fail "the drive does not tell its position"
     raw=$(sed -n 's/.* 585#43646000\(..\)\(..\)\(..\)\(..\).*/\4\3\2\1/p' $scratch/dump | tail -n 1)
     /usr/bin/awk -v v=$((0x$raw)) 'BEGIN { print (v > 2147483647 ? v - 4294967296 : v) / 1000 }'
 }
@@ -241,14 +241,20 @@ arrived() {
     state_is 0x0400 0x0400
 }
 
+# boots: is reset, and says so; candump may not have listened yet.
+boots() {
+    cansend can0 000#8105
+    sleep 0.5
+    grep -q ' 705#00' $scratch/dump
+}
+
 can_by_hand() {
     simulated_robot
     candump -L can0 >$scratch/dump 2>/dev/null &
     others=$!
-    cansend can0 000#8105 # reset the node: it boots up
-    until_true 10 grep -q ' 705#00' $scratch/dump || fail "no boot-up message"
+    until_true 30 boots || fail "no boot-up message"
     cansend can0 000#0105 # start it
-    until_true 10 grep -q ' 705#05\| 185#' $scratch/dump || sleep 1
+    sleep 1
     state_is 0x4F 0x40 || fail "it begins with status word $(statusword), not 'switch on disabled'"
     sdo_write 2F60600001000000 # profile position
     sdo_write 2381600060EA0000 # 60 degrees a second
@@ -258,7 +264,7 @@ can_by_hand() {
     sdo_write 237A600010270000 # 10 degrees
     step_to 1F00 0x1000 0x1000 "set-point acknowledged"
     step_to 0F00 0x1000 0x0000 "set-point bit taken back"
-    until_true 10 arrived || fail "it does not arrive: $(statusword)"
+    until_true 30 arrived || fail "it does not arrive: $(statusword)"
     at=$(position_deg)
     below "$at" 10.01 && below 9.99 "$at" || fail "it stands at $at degrees, not at 10"
     step_to 0200 0x4F 0x40 "switch on disabled after a quick stop"

@@ -45,7 +45,7 @@ static const struct config_device *find_device(const struct config *config, cons
 
 static bool is_tilt(const struct config_device *device)
 {
-	return keys_driver(device->driver) & (KEY_SERVO | KEY_CAN) || device->encoder.set;
+	return keys_driver(device->driver) & (KEY_SERVO | KEY_CAN | KEY_CARMEN) || device->encoder.set;
 }
 
 /* The name of the first device that tilts, for messages. */

@@ -168,6 +168,8 @@ struct config_device {
 		int64_t within_ns;
 	} homing;
 
+	char message[CONFIG_NAME_MAX]; /* carmen: its name; empty: the front laser's */
+
 	/* pose */
 	enum { JUMP_KEEP, JUMP_IGNORE, JUMP_NEW_MAP } on_jump;
 	double jump_m, jump_rad;      /* beyond what the motion explains: a jump */

@@ -26,7 +26,7 @@ const struct key key_table[] = {
 	{GROUP_TOP, "map", KEY_GROUP, .inner = GROUP_MAP, .help = "The map: a signed distance in every voxel near a surface, turned into triangles."},
 	{GROUP_TOP, "robot", KEY_GROUP, .inner = GROUP_ROBOT, .help = "The robot's own body and what it can climb."},
 	{GROUP_TOP, "mount", KEY_GROUP, .inner = GROUP_MOUNT, .help = "Where the scanner sits: map <- base <- tilt axis <- laser, x forward, y left, z up. The lever arm from the axis to the mirror's centre matters: without it walls become double."},
-	{GROUP_TOP, "devices", KEY_DEVICES, .inner = GROUP_DEVICE, .help = "What is plugged in; at most 16. Every device has a name and a driver: lms2xx (SICK LMS200, 211, 220, 221, 291), tim (SICK TiM3xx, 5xx, 7xx), lms1xx, lms5xx, modbus and canopen (servos that tilt the scanner, or tell its angle), can (its angle in a CAN frame), pose (the robot's localisation), odometry (the motion of its wheels, in CAN frames)."},
+	{GROUP_TOP, "devices", KEY_DEVICES, .inner = GROUP_DEVICE, .help = "What is plugged in; at most 16. Every device has a name and a driver: lms2xx (SICK LMS200, 211, 220, 221, 291), tim (SICK TiM3xx, 5xx, 7xx), lms1xx, lms5xx, modbus and canopen (servos that tilt the scanner, or tell its angle), can (its angle in a CAN frame), pose (the robot's localisation), odometry (the motion of its wheels, in CAN frames), carmen (lines of a CARMEN log, for replay only)."},
 	{GROUP_TOP, "sweep", KEY_GROUP, .inner = GROUP_SWEEP, .flag = offsetof(struct config, sweep.set), .help = "How the servo is commanded. Without this section it is only listened to."},
 	{GROUP_TOP, "listen", KEY_GROUP, .inner = GROUP_LISTEN, .help = "Where clients connect."},
 	{GROUP_TOP, "record", KEY_GROUP, .inner = GROUP_RECORD, .help = "Recordings of what the devices sent."},
@@ -56,7 +56,7 @@ const struct key key_table[] = {
 	{GROUP_FRAME, "rpy", KEY_VECTOR, .preset = "[0, 0, 0]", .dimension = DIMENSION_ANGLE, .min = DEG(-360), .max = DEG(360), .offset = sizeof(struct vec3), .size = sizeof(struct vec3), .help = "Roll, pitch, yaw about the fixed axes x, y, z."},
 
 	{GROUP_DEVICE, "name", KEY_TEXT, KEY_ALL, .required = true, DEVICE(name), .help = "What messages, `tilt` and `sweep.device` call it: letters, digits, - and _."},
-	{GROUP_DEVICE, "driver", KEY_TEXT, KEY_ALL, .required = true, .choices = "lms2xx|modbus|pose|tim|lms1xx|lms5xx|can|canopen|odometry", DEVICE(driver), .help = "What it is."},
+	{GROUP_DEVICE, "driver", KEY_TEXT, KEY_ALL, .required = true, .choices = "lms2xx|modbus|pose|tim|lms1xx|lms5xx|can|canopen|odometry|carmen", DEVICE(driver), .help = "What it is."},
 
 	{GROUP_DEVICE, "port", KEY_TEXT, KEY_LMS2XX, .required = true, .example = "/dev/ttyUSB0", DEVICE(port), .help = "Serial line: a path (names under /dev/serial/by-id/ stay the same over reboots), or usb:VENDOR:PRODUCT[:SERIAL], an adapter wherever it is plugged in."},
 	{GROUP_DEVICE, "baud", KEY_INTEGER, KEY_LMS2XX, .preset = "38400", .example = "500000", .choices = "9600|19200|38400|500000", DEVICE(baud), .help = "Rate to stream at; the rate the scanner has now is found. 500000 needs RS-422."},
@@ -75,6 +75,8 @@ const struct key key_table[] = {
 	{GROUP_DEVICE, "every", KEY_INTEGER, KEY_COLA, .preset = "keep", .word = "keep", .word_value = 0, .min = 1, .max = 1000, DEVICE(every), .help = "Every n-th scan is sent; keep: as the scanner is set."},
 	{GROUP_DEVICE, "remission", KEY_CHOICE, KEY_COLA, .preset = "keep", .choices = "keep|off|8|16", DEVICE(remission), .help = "Bits of remission sent with every beam; keep: as the scanner is set."},
 	{GROUP_DEVICE, "stamp", KEY_CHOICE, KEY_COLA, .preset = "auto", .choices = "auto|start|end", DEVICE(stamp), .help = "What the scanner's time stamp marks: the start or the end of a scan; auto: by the model."},
+	{GROUP_DEVICE, "message", KEY_TEXT, KEY_CARMEN, .preset = "", .example = "ROBOTLASER1", DEVICE(message), .help = "The message that is this scanner; empty: the front one, FLASER, ROBOTLASER1 or RAWLASER1."},
+	{GROUP_DEVICE, "encoder", KEY_GROUP, KEY_CARMEN, .example = "{scale: 57.29578deg, zero: 0, sign: 1}", .inner = GROUP_ENCODER, .flag = offsetof(struct config_device, encoder.set), .help = "What the tilt of a PANTILT line (radians) means: angle = sign * scale * (tilt - zero). Left out: it is the angle, positive looks down. Name this device as `tilt`."},
 	{GROUP_DEVICE, "encoder", KEY_GROUP, KEY_LMS1XX | KEY_LMS5XX, .example = "{scale: 0.01deg, zero: 0, sign: 1}", .inner = GROUP_ENCODER, .flag = offsetof(struct config_device, encoder.set), .help = "An incremental encoder on the scanner's own inputs, whose ticks come with every profile: angle = sign * scale * (ticks - zero). Name this device as `tilt`, its own or another scanner's."},
 
 	{GROUP_DEVICE, "latency", KEY_DURATION, KEY_SCANNER, .preset = "0", .dimension = DIMENSION_TIME, .min = -1, .max = 1, DEVICE(latency_ns), .help = "How much earlier a profile was measured than its time says; calibrated, may be negative."},
@@ -82,6 +84,7 @@ const struct key key_table[] = {
 	{GROUP_DEVICE, "range", KEY_PAIR, KEY_TIM, .preset = "[0.05, 25]", .dimension = DIMENSION_LENGTH, .min = 0, .max = 100, DEVICE(range_min_m), .help = "Beams outside are dropped and clear nothing."},
 	{GROUP_DEVICE, "range", KEY_PAIR, KEY_LMS1XX, .preset = "[0.05, 50]", .dimension = DIMENSION_LENGTH, .min = 0, .max = 100, DEVICE(range_min_m), .help = "Beams outside are dropped and clear nothing."},
 	{GROUP_DEVICE, "range", KEY_PAIR, KEY_LMS5XX, .preset = "[0.05, 82]", .dimension = DIMENSION_LENGTH, .min = 0, .max = 100, DEVICE(range_min_m), .help = "Beams outside are dropped and clear nothing."},
+	{GROUP_DEVICE, "range", KEY_PAIR, KEY_CARMEN, .preset = "[0.05, 80]", .dimension = DIMENSION_LENGTH, .min = 0, .max = 100, DEVICE(range_min_m), .help = "Beams outside are dropped and clear nothing."},
 	{GROUP_DEVICE, "mask", KEY_MASKS, KEY_SCANNER, .preset = "[]", .dimension = DIMENSION_ANGLE, .min = DEG(-180), .max = DEG(180), .help = "Bearings left out, e.g. [[-90deg, -80deg]]: 0 is straight ahead, positive left."},
 	{GROUP_DEVICE, "tilt", KEY_TILT, KEY_SCANNER, .preset = "0deg", .example = "servo", .dimension = DIMENSION_ANGLE, .min = DEG(-180), .max = DEG(180), .help = "The device that tilts this one, or the fixed angle at which it is mounted."},
 
@@ -226,7 +229,7 @@ const struct key key_table[] = {
 /* clang-format on */
 
 static const char *const driver_names[] = {"lms2xx", "modbus", "pose",    "tim",      "lms1xx",
-                                           "lms5xx", "can",    "canopen", "odometry", NULL};
+                                           "lms5xx", "can",    "canopen", "odometry", "carmen", NULL};
 
 unsigned keys_driver(const char *name)
 {

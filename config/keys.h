@@ -71,11 +71,12 @@ enum key_type {
 #define KEY_CAN      64u
 #define KEY_CANOPEN  128u
 #define KEY_ODOMETRY 256u
+#define KEY_CARMEN   512u
 #define KEY_COLA     (KEY_TIM | KEY_LMS1XX | KEY_LMS5XX)
-#define KEY_SCANNER  (KEY_LMS2XX | KEY_COLA)
+#define KEY_SCANNER  (KEY_LMS2XX | KEY_COLA | KEY_CARMEN)
 #define KEY_ON_CAN   (KEY_CAN | KEY_CANOPEN | KEY_ODOMETRY)
 #define KEY_SERVO    (KEY_MODBUS | KEY_CANOPEN) /* those that can be commanded */
-#define KEY_ALL      511u
+#define KEY_ALL      1023u
 
 struct key {
 	enum key_group group;

@@ -32,7 +32,8 @@
 #define NOTE_MAX   400
 #define NO_TIME    INT64_MAX
 
-static const struct replay_format *const formats[] = {&replay_recording, &replay_journal};
+static const struct replay_format *const formats[] = {
+    &replay_recording, &replay_journal, &replay_candump, &replay_poses, &replay_carmen, &replay_capture, &replay_scan};
 
 struct source {
 	char *path;

@@ -37,6 +37,11 @@ struct replay_format {
 	void (*note)(const struct replay_source *, char ret[REPLAY_SENTENCE_MAX]); /* may be NULL */
 };
 
+/* The line at `*at` of a text without its end, and `*at` behind it; false at the end. Lines beyond 1 MB are cut. */
+bool replay_line(const struct replay_file *, size_t *at, const char **ret_line, size_t *ret_len);
+/* The device that takes poses as JSON datagrams; -1: none. */
+int replay_pose_device(const struct config *);
+
 #define REPLAY_SCAN_NS 30000000000ll
 
 extern const struct replay_format replay_recording, replay_journal, replay_scan, replay_candump, replay_capture,

@@ -142,6 +142,6 @@ extern const struct driver *const driver_table[];
 const struct driver *driver_find(const char *name); /* NULL: unknown */
 
 extern const struct driver driver_lms2xx, driver_modbus, driver_pose, driver_tim, driver_lms1xx, driver_lms5xx,
-    driver_can, driver_canopen, driver_odometry;
+    driver_can, driver_canopen, driver_odometry, driver_carmen;
 
 #endif

@@ -3,7 +3,7 @@
 #include <stdlib.h>
 #include <string.h>
 
-#include "tools/candump.h"
+#include "drivers/candump.h"
 
 int LLVMFuzzerTestOneInput(const uint8_t *data, size_t size);
 

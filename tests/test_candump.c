@@ -10,7 +10,7 @@
 #include <stdlib.h>
 #include <string.h>
 
-#include "tools/candump.h"
+#include "drivers/candump.h"
 
 static enum candump_kind read_line(const char *text, struct candump_line *ret)
 {

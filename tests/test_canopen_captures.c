@@ -14,7 +14,7 @@
 #include "drivers/canopen_setup.h"
 #include "tests/canopen_node.h"
 #include "tests/captures.h"
-#include "tools/candump.h"
+#include "drivers/candump.h"
 
 #define STARTUP_LOG  "can/canopen_cia402_two_drives_startup.log"
 #define STARTUP_TEXT "can/canopen_cia402_two_drives_startup.candump.txt"

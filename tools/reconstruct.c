@@ -21,16 +21,14 @@
 
 #include "core/map.h"
 #include "core/model.h"
-#include "core/sweep.h"
 #include "core/text.h"
 #include "core/trig.h"
+#include "daemon/scan_rows.h"
 #include "tools/commands.h"
 #include "tools/figures.h"
 #include "tools/options.h"
 #include "tools/output.h"
 
-#define ROW_NS   100000000LL /* between the profiles of a scan; its servo stands while one is measured */
-#define BEAM_NS  37037
 #define FILE_MAX ((size_t)4 << 30)
 
 struct run {
@@ -225,78 +223,33 @@ static int find_pose(const struct run *run, bool scan, struct transform *ret)
 
 /* Inputs */
 
-static void make_profile(const struct uos_row *row, int64_t t_ns, struct profile *ret)
-{
-	ret->t_ns = t_ns;
-	ret->beam_ns = BEAM_NS;
-	ret->turn_ns = 0;
-	ret->interlace = 1;
-	ret->part = 0;
-	ret->parts = 1;
-	ret->n = (uint16_t)row->n;
-	ret->first_rad = row->first_rad;
-	ret->step_rad = row->step_rad;
-	memcpy(ret->range_m, row->range_m, row->n * sizeof *row->range_m);
-	memcpy(ret->state, row->state, row->n);
-}
-
-/* Hands on the rows that are complete. */
-static int take_rows(struct run *run, struct sweep *sweep, bool end)
+static int feed_rows(struct run *run, struct scan_rows *rows)
 {
 	struct row *row;
-	enum sweep_drop drop;
-	enum sweep_verdict verdict;
-	while ((verdict = sweep_next(sweep, 0, end, &row, &drop)) != SWEEP_WAIT) {
+	int r;
+
+	while ((r = scan_rows_next(rows, &row)) == 1) {
 		lap(run, ASSEMBLE);
-		if (verdict == SWEEP_NOMEM)
-			return out_of_memory(run->options.input[run->input]);
-		if (verdict == SWEEP_ROW) {
-			row->number = run->figures.rows++;
-			map_row(run->map, row);
-		}
+		row->number = run->figures.rows++;
+		map_row(run->map, row);
 		lap(run, INTEGRATE);
 	}
 	lap(run, ASSEMBLE);
-	return 0;
-}
-
-static int feed_rows(struct run *run, struct sweep *sweep, const struct uos_scan *scan)
-{
-	int64_t begin_ns = (int64_t)run->figures.rows * ROW_NS;
-	struct profile profile;
-	int r = 0;
-	for (uint32_t i = 0; r == 0 && i < scan->rows; i++) {
-		struct tilt before = {begin_ns + i * ROW_NS, scan->row[i].tilt_rad};
-		struct tilt after = {before.t_ns + scan->row[i].n * BEAM_NS, before.angle_rad};
-		make_profile(&scan->row[i], before.t_ns, &profile);
-		sweep_tilt(sweep, &before);
-		sweep_profile(sweep, &profile, 0);
-		sweep_tilt(sweep, &after);
-		r = take_rows(run, sweep, i + 1 == scan->rows);
-	}
-	return r;
+	return r < 0 ? out_of_memory(run->options.input[run->input]) : 0;
 }
 
 static int add_raster(struct run *run, const struct uos_scan *scan, const struct transform *pose)
 {
-	const struct sweep_params params = {
-	    .base_tilt = transform_identity(),
-	    .tilt_laser = transform_identity(),
-	    .range_min_m = UOS_RANGE_MIN_M,
-	    .range_max_m = UOS_RANGE_MAX_M,
-	    .hold_ns = INT64_MAX,
-	    .fixed_pose = true,
-	    .map_base = *pose,
-	};
-	struct sweep *sweep = sweep_create(&params);
-	if (!sweep)
-		return out_of_memory(run->options.input[run->input]);
-	int r = feed_rows(run, sweep, scan);
 	struct sweep_stats stats;
-	sweep_stats(sweep, &stats);
+	struct scan_rows rows;
+
+	if (scan_rows_begin(&rows, scan, pose, (int64_t)run->figures.rows * SCAN_ROW_NS) < 0)
+		return out_of_memory(run->options.input[run->input]);
+	int r = feed_rows(run, &rows);
+	scan_rows_stats(&rows, &stats);
 	run->figures.points += stats.beams[BEAM_OK] + stats.beams[BEAM_MIXED];
 	run->figures.sweeps += stats.sweeps;
-	sweep_destroy(sweep);
+	scan_rows_finish(&rows);
 	return r;
 }
 

@@ -11,7 +11,7 @@
  *
  * An id of 3 digits is standard, of 8 extended, or an error frame where it has that flag: the number of digits alone
  * tells 001 from 00000001. */
-#include "tools/candump.h"
+#include "drivers/candump.h"
 
 #include <string.h>
 

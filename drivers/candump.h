@@ -1,6 +1,6 @@
 /* Lines of candump: its log (-l, -L), and what it prints on a terminal. Pure. */
-#ifndef FACET_TOOLS_CANDUMP_H
-#define FACET_TOOLS_CANDUMP_H
+#ifndef FACET_DRIVERS_CANDUMP_H
+#define FACET_DRIVERS_CANDUMP_H
 
 #include "drivers/can_wire.h"
 

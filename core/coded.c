@@ -178,7 +178,7 @@ static uint32_t code_plane(struct coder *coder, uint32_t next, uint32_t plane)
 	case PLANE_NEXT:
 		return next;
 	default:
-		return code_raw(coder, 16, plane >> 16) << 16 | code_raw(coder, 16, plane & 0xffff);
+		return code_raw(coder, 32, plane);
 	}
 }
 

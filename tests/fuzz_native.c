@@ -72,29 +72,81 @@ static void check_round_trip(const uint8_t *frame, size_t len, const struct nati
 	buffer_finish(&b);
 }
 
+/* A frame that was packed is, unpacked, the frame it was. */
+static void check_packing(struct native_packer *packer, const uint8_t *frame, size_t len)
+{
+	struct buffer packed = {0}, plain = {0};
+	char error[128];
+
+	must(native_put_packed(packer, &packed, frame, len) == 0);
+	if (native_is_packed(packed.data))
+		must(packed.len < len && native_unpack(packed.data, packed.len, len, &plain, error) == 0);
+	else
+		buffer_append(&plain, packed.data, packed.len);
+	must(plain.len == len && memcmp(plain.data, frame, len) == 0);
+	buffer_finish(&packed);
+	buffer_finish(&plain);
+}
+
+/* 0, 1 after a COMMIT, negative: the client hangs up. */
+static int hear(struct native_mirror *mirror, struct native_packer *packer, const uint8_t *frame, size_t len)
+{
+	struct native_message message;
+	char error[128];
+	int decoded = native_decode(frame, len, &message, error);
+
+	must(decoded == 0 || strlen(error) < sizeof(error));
+	if (decoded < 0)
+		return 0;
+	check_round_trip(frame, len, &message);
+	check_packing(packer, frame, len);
+	return native_mirror_apply(mirror, &message, error);
+}
+
+static void check_last_batch(const struct native_mirror *mirror)
+{
+	size_t n;
+	struct patch *const *patch = native_mirror_changed(mirror, &n);
+
+	must(native_mirror_hello(mirror) != NULL);
+	must(!native_mirror_was_reset(mirror) || patch_store_count(native_mirror_patches(mirror)) <= n);
+
+	for (size_t i = 0; i < n; i++)
+		must(patch[i]->nt > 0 && patch[i]->version <= native_mirror_step(mirror));
+	patch = native_mirror_removed(mirror, &n);
+	for (size_t i = 0; i < n; i++)
+		must(patch[i]->nt == 0);
+}
+
 int LLVMFuzzerTestOneInput(const uint8_t *data, size_t size)
 {
 	struct native_mirror *mirror = native_mirror_create();
-	char error[128];
+	struct native_packer *packer = native_packer_create();
 	int r = 0;
 
+	must(mirror && packer);
 	while (r >= 0) {
-		struct native_message message;
+		struct buffer plain = {0};
 		ssize_t n = native_scan(data, size, NATIVE_TO_CLIENT_MAX);
-		int decoded;
+		char error[128];
 
 		if (n <= 0)
 			break;
 		must((size_t)n <= size);
-		decoded = native_decode(data, (size_t)n, &message, error);
-		must(decoded == 0 || strlen(error) < sizeof(error));
-		if (decoded == 0) {
-			check_round_trip(data, (size_t)n, &message);
-			r = native_mirror_apply(mirror, &message, error);
+		if (native_is_packed(data) && native_unpack(data, (size_t)n, 1 << 20, &plain, error) == 0) {
+			must(plain.len <= 1 << 20);
+			r = hear(mirror, packer, plain.data, plain.len);
+		} else {
+			r = hear(mirror, packer, data, (size_t)n);
 		}
+		if (r == 1)
+			check_last_batch(mirror);
+		buffer_finish(&plain);
 		data += n;
 		size -= (size_t)n;
 	}
+	native_mirror_lost(mirror);
+	native_packer_destroy(packer);
 	native_mirror_destroy(mirror);
 	return 0;
 }

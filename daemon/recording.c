@@ -382,7 +382,7 @@ static bool is_time(int64_t t_ns)
 }
 
 /* What reading one message, or one event's JSON, says: an event, nothing for the caller, or damage. */
-enum verdict { VERDICT_EVENT, VERDICT_NOTHING, VERDICT_DAMAGED };
+enum verdict { VERDICT_EVENT, VERDICT_NOTHING, VERDICT_DAMAGED, VERDICT_NOMEM };
 
 static enum verdict damaged(struct recording_event *ret, const char *what)
 {
@@ -428,7 +428,8 @@ static enum verdict read_begin(struct recording_reader *r, json_t *json, struct 
 
 static enum verdict read_event(struct recording_reader *r, const uint8_t *data, size_t len, struct recording_event *ret)
 {
-	json_t *json = json_loadb((const char *)data, len, 0, NULL);
+	json_error_t error;
+	json_t *json = json_loadb((const char *)data, len, 0, &error);
 	const char *class = json_string_value(json_object_get(json, "class"));
 	json_t *number = json_object_get(json, "number"), *ahead = json_object_get(json, "ahead_ns");
 	enum verdict verdict = VERDICT_EVENT;
@@ -436,7 +437,9 @@ static enum verdict read_event(struct recording_reader *r, const uint8_t *data, 
 	ret->kind = RECORDING_EVENT;
 	ret->json.text = (const char *)data;
 	ret->json.len = len;
-	if (!class)
+	if (!json && (json_error_code(&error) == json_error_out_of_memory || !error.text[0]))
+		verdict = VERDICT_NOMEM;
+	else if (!class)
 		verdict = damaged(ret, "an event that is none");
 	else if (strcmp(class, "BEGIN") == 0)
 		verdict = read_begin(r, json, ret);
@@ -518,6 +521,7 @@ static enum verdict read_message(struct recording_reader *r, const struct role *
 static int read_item(struct recording_reader *r, const struct mcap_item *item, struct recording_event *ret)
 {
 	const struct role *role;
+	enum verdict verdict;
 
 	*ret = (struct recording_event){.log_ns = r->log_ns, .offset = item->offset};
 	if (item->kind == MCAP_CHUNK)
@@ -531,7 +535,8 @@ static int read_item(struct recording_reader *r, const struct mcap_item *item, s
 	role = role_of(r, item->message.channel);
 	if (!role)
 		return -ENOMEM;
-	return read_message(r, role, item, ret) != VERDICT_NOTHING;
+	verdict = read_message(r, role, item, ret);
+	return verdict == VERDICT_NOMEM ? -ENOMEM : verdict != VERDICT_NOTHING;
 }
 
 static bool moves(enum recording_kind kind)

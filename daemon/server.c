@@ -152,7 +152,7 @@ static void fill_stream(struct connection *c)
 	n = (uint32_t)(c->out.len - 4);
 	for (int i = 0; i < 4; i++)
 		c->out.data[i] = (uint8_t)(n >> 8 * i);
-	if (ended)
+	if (ended && n == 0)
 		end_stream(c, reason);
 	else if (n == 0)
 		c->out.len = 0;

@@ -248,11 +248,283 @@ static void what_was_handled_comes_back_byte_for_byte_with_skips_ahead_of_their_
 		}
 }
 
-int main(void)
+/* How far the file was gone through, whatever is wrong with it: events must be those that were written, in order, with some
+ * left out only where damage was told. How many came, and how many damages. */
+static size_t expect_part(const struct buffer *file, unsigned *ret_damages)
+{
+	struct recording_reader *r = NULL;
+	struct recording_event event;
+	size_t at = 0, came = 0;
+	char error[160];
+	int got;
+
+	*ret_damages = 0;
+	got = recording_reader_create(file->data, file->len, &r, error);
+	if (got == -EINVAL)
+		return 0;
+	assert_int_equal(got, 0);
+	recording_reader_use(r, &config);
+	while ((got = recording_reader_next(r, &event)) == 1) {
+		if (event.kind == RECORDING_DAMAGED) {
+			(*ret_damages)++;
+			continue;
+		}
+		if (event.kind == RECORDING_END)
+			continue;
+		while (at < session.n && !same(&event, &session.event[at])) {
+			assert_true(*ret_damages > 0);
+			at++;
+		}
+		assert_true(at < session.n);
+		at++;
+		came++;
+	}
+	assert_int_equal(got, 0);
+	recording_reader_destroy(r);
+	return came;
+}
+
+static struct buffer copy_of(const struct buffer *file, size_t len)
+{
+	struct buffer copy = {0};
+
+	buffer_append(&copy, file->data, len);
+	return copy;
+}
+
+/* The ends of the chunks, where a kill leaves a file. */
+static size_t chunk_ends(const struct buffer *file, size_t *ret_end, size_t *ret_events, size_t max)
+{
+	struct mcap_reader *r;
+	struct mcap_item item;
+	char error[160];
+	size_t n = 0;
+
+	assert_int_equal(mcap_reader_create(file->data, file->len, &r, error), 0);
+	while (mcap_reader_next(r, &item) == 1)
+		if (item.kind == MCAP_CHUNK && n < max) {
+			ret_end[n] = item.end;
+			ret_events[n++] = 0;
+		}
+	mcap_reader_destroy(r);
+	for (size_t i = 0; i < n; i++) {
+		struct buffer part = copy_of(file, ret_end[i]);
+		unsigned damages;
+
+		ret_events[i] = expect_part(&part, &damages);
+		assert_int_equal(damages, 0);
+		buffer_finish(&part);
+	}
+	return n;
+}
+
+static void a_file_cut_at_any_byte_gives_every_whole_chunk(void **state)
+{
+	struct buffer file = {0};
+	size_t end[64], events[64], n;
+
+	(void)state;
+	write_session(40, 1000, 1, true, &file);
+	n = chunk_ends(&file, end, events, 64);
+	assert_true(n > 5);
+	for (size_t len = 0; len < file.len; len++) {
+		struct buffer part = copy_of(&file, len);
+		size_t whole = 0, came;
+		unsigned damages;
+
+		while (whole < n && end[whole] <= len)
+			whole++;
+		came = expect_part(&part, &damages);
+		assert_true(damages <= 2);
+		assert_int_equal(came, whole == 0 ? 0 : events[whole - 1]);
+		buffer_finish(&part);
+	}
+	assert_int_equal(events[n - 1], session.n);
+	buffer_finish(&file);
+}
+
+static void a_changed_byte_costs_no_more_than_its_chunk(void **state)
+{
+	struct buffer file = {0};
+	size_t most = 0, worst = 0;
+
+	(void)state;
+	write_session(80, 800, 1, true, &file);
+	for (size_t at = MCAP_MAGIC; at < file.len; at += 3) {
+		struct buffer part = copy_of(&file, file.len);
+		unsigned damages;
+		size_t came;
+
+		part.data[at] ^= (uint8_t)(1 + at % 255);
+		came = expect_part(&part, &damages);
+		if (session.n - came > most) {
+			most = session.n - came;
+			worst = at;
+		}
+		buffer_finish(&part);
+	}
+	if (most == 0 || most >= session.n / 3)
+		fail_msg("byte %zu of %zu costs %zu of %zu events", worst, file.len, most, session.n);
+	printf("note: of %zu events at most %zu are lost with a byte of a file of %zu\n", session.n, most, file.len);
+	buffer_finish(&file);
+}
+
+static void bytes_cut_out_or_put_in_cost_no_more_than_the_chunks_they_touch(void **state)
+{
+	struct buffer file = {0};
+
+	(void)state;
+	write_session(600, 2000, 1, true, &file);
+	for (unsigned trial = 0; trial < 100; trial++) {
+		const size_t at = 4000 + roll() % (file.len - 8000), n = 1 + roll() % 2000;
+		struct buffer part = copy_of(&file, at);
+		unsigned damages;
+
+		if (trial % 2) { /* a hole */
+			buffer_append(&part, file.data + at + n, file.len - at - n);
+		} else {
+			for (size_t i = 0; i < n; i++)
+				buffer_append(&part, &(uint8_t){(uint8_t)roll()}, 1);
+			buffer_append(&part, file.data + at, file.len - at);
+		}
+		assert_true(expect_part(&part, &damages) > session.n / 2);
+		buffer_finish(&part);
+	}
+	buffer_finish(&file);
+}
+
+static void seeking_finds_the_first_chunk_that_reaches_the_time(void **state)
+{
+	struct buffer file = {0};
+	struct mcap_reader *r, *walk;
+	struct mcap_item item, chunk;
+	char error[160];
+	uint64_t first_ns, last_ns;
+
+	(void)state;
+	write_session(600, 2000, 1, true, &file);
+	assert_int_equal(mcap_reader_create(file.data, file.len, &r, error), 0);
+	assert_int_equal(mcap_reader_create(file.data, file.len, &walk, error), 0);
+	assert_true(mcap_reader_span(r, &first_ns, &last_ns) > 10);
+	assert_int_equal(first_ns, START_NS);
+	for (uint64_t t_ns = first_ns; t_ns <= last_ns; t_ns += 7000000) {
+		assert_int_equal(mcap_reader_seek(r, (int64_t)t_ns), 0);
+		assert_int_equal(mcap_reader_next(r, &item), 1);
+		assert_int_equal(item.kind, MCAP_CHUNK);
+		mcap_reader_rewind(walk);
+		do
+			assert_int_equal(mcap_reader_next(walk, &chunk), 1);
+		while (chunk.kind != MCAP_CHUNK || chunk.chunk.end_ns < t_ns);
+		assert_int_equal(item.offset, chunk.offset);
+		assert_int_equal(mcap_reader_next(r, &item), 1);
+		assert_int_equal(item.kind, MCAP_MESSAGE);
+	}
+	assert_int_equal(mcap_reader_seek(r, (int64_t)last_ns + 1), 0);
+	while (mcap_reader_next(r, &item) == 1)
+		assert_true(item.kind != MCAP_MESSAGE);
+	mcap_reader_destroy(walk);
+	mcap_reader_destroy(r);
+	buffer_finish(&file);
+}
+
+static void a_chunk_that_grows_beyond_its_word_is_refused_without_memory_for_it(void **state)
+{
+	struct buffer file = {0};
+	unsigned damages;
+	size_t end[64], events[64], n;
+	uint64_t huge = UINT64_C(1) << 40;
+
+	(void)state;
+	write_session(120, 2000, 1, true, &file);
+	n = chunk_ends(&file, end, events, 64);
+	assert_true(n > 4);
+	for (size_t at = 0; at + 32 < file.len; at++) /* the heads of all chunks lie */
+		if (file.data[at] == 6 && memcmp(file.data + at + 9 + 28, "\4\0\0\0zstd", 8) == 0)
+			memcpy(file.data + at + 9 + 16, &huge, 8);
+	assert_int_equal(expect_part(&file, &damages), 0);
+	buffer_finish(&file);
+}
+
+/* One call of an allocator after the other fails: no crash and no leak. (The JSON library may tell such an event as damaged.) */
+static void memory_that_runs_out_anywhere_is_an_error_and_no_leak(void **state)
+{
+	const struct recording_params params = {&config, config_text, "1.2", 1};
+	const struct recording_begin begin = {START_NS, "0123456789abcde", 3, true, 1, 0, "state", 5};
+	struct record record = {START_NS, START_NS, 0, FROM_DEVICE, (const uint8_t *)"abc", 3};
+	bool done = false;
+	long n;
+
+	(void)state;
+	if (!SCARCE_WORKS)
+		skip();
+	for (n = 0; !done && n < 2000; n++) {
+		const long before = scarce_live;
+		struct buffer file = {0};
+		struct recording_writer *w;
+		struct recording_reader *r = NULL;
+		struct recording_event event;
+		char error[160];
+		int got = -ENOMEM;
+
+		scarce_left = n;
+		w = recording_writer_create(&params, &begin, &file);
+		if (w)
+			got = recording_put_record(w, &record);
+		if (got == 0)
+			got = recording_put_skip(w, 1, "queue full");
+		if (got == 0)
+			got = recording_end(w, "ended");
+		recording_writer_destroy(w);
+		if (got == 0)
+			got = recording_reader_create(file.data, file.len, &r, error);
+		for (int i = 0; got >= 0 && i < 4; i++)
+			got = recording_reader_next(r, &event);
+		done = got == 1 && scarce_left > 0;
+		scarce_left = -1;
+		recording_reader_destroy(r);
+		buffer_finish(&file);
+		assert_int_equal(scarce_live, before);
+	}
+	assert_true(done && n > 20);
+	printf("note: %ld allocations failed, each alone\n", n - 1);
+}
+
+static void what_is_no_recording_is_refused_with_a_sentence(void **state)
+{
+	struct recording_reader *r;
+	struct buffer out = {0};
+	struct mcap_writer *w;
+	char error[160] = "";
+
+	(void)state;
+	assert_int_equal(recording_reader_create((const uint8_t *)"", 0, &r, error), -EINVAL);
+	assert_non_null(strstr(error, "is empty"));
+	assert_int_equal(recording_reader_create((const uint8_t *)"not a recording", 15, &r, error), -EINVAL);
+	assert_non_null(strstr(error, "no MCAP"));
+	w = mcap_writer_create(&(struct mcap_params){"other", 0}, &out);
+	assert_int_equal(mcap_writer_channel(w, 0, "/other", "json", NULL, 0), 1);
+	must(mcap_writer_message(w, &(struct mcap_message){1, 5, 5, "{}", 2, NULL, 0}));
+	must(mcap_writer_end(w));
+	mcap_writer_destroy(w);
+	assert_int_equal(recording_reader_create(out.data, out.len, &r, error), -EINVAL);
+	assert_non_null(strstr(error, "no recording of facetd"));
+	buffer_finish(&out);
+}
+
+int main(int argc, char **argv)
 {
 	const struct CMUnitTest tests[] = {
 	    cmocka_unit_test(what_was_handled_comes_back_byte_for_byte_with_skips_ahead_of_their_record),
+	    cmocka_unit_test(a_file_cut_at_any_byte_gives_every_whole_chunk),
+	    cmocka_unit_test(a_changed_byte_costs_no_more_than_its_chunk),
+	    cmocka_unit_test(bytes_cut_out_or_put_in_cost_no_more_than_the_chunks_they_touch),
+	    cmocka_unit_test(seeking_finds_the_first_chunk_that_reaches_the_time),
+	    cmocka_unit_test(a_chunk_that_grows_beyond_its_word_is_refused_without_memory_for_it),
+	    cmocka_unit_test(memory_that_runs_out_anywhere_is_an_error_and_no_leak),
+	    cmocka_unit_test(what_is_no_recording_is_refused_with_a_sentence),
 	};
 
+	if (argc > 1)
+		cmocka_set_test_filter(argv[1]);
 	return cmocka_run_group_tests(tests, read_config, NULL);
 }

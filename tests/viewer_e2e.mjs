@@ -2,7 +2,7 @@
 // The devices and facetd are two processes here, so that facetd can be ended and started again.
 import assert from 'node:assert/strict';
 import { spawn } from 'node:child_process';
-import { existsSync, mkdtempSync, readFileSync, rmSync, writeFileSync } from 'node:fs';
+import { existsSync, mkdtempSync, readdirSync, readFileSync, rmSync, writeFileSync } from 'node:fs';
 import { connect, createServer } from 'node:net';
 import { tmpdir } from 'node:os';
 import { join, resolve } from 'node:path';
@@ -63,6 +63,13 @@ function grantToken() {
     `record: {dir: "${dir}"}\n`);
 }
 
+// The same without devices' recording of what is replayed.
+function replayConfig() {
+  const config = join(dir, 'replay.yaml');
+  writeFileSync(config, readFileSync(join(dir, 'facetd.yaml'), 'utf8').replace(/^record: .*\n/m, ''));
+  return config;
+}
+
 let address;
 const startDaemon = async () => {
   const daemon = start('facetd', '--config', join(dir, 'facetd.yaml'));
@@ -119,6 +126,15 @@ const claims = {
     }
     assert.ok(bytes > 0 && bytes <= TINY, `${bytes} bytes`);
     console.log(`note: the page takes ${Math.round(bytes / 1024)} KB`);
+  },
+
+  async 'it shows the robot, the angle of its servo, its laser and its trail'({ page }) {
+    await page.until('the robot', 60, 'viewer.robot.body.visible && viewer.live.scanners().length === 1');
+    await page.until('a profile', 60, `viewer.live.scanners()[0].scan?.ranges.length > 100 && [...viewer.robot.heads.values()].some(({ fan }) => fan.visible)`);
+    await page.until('the angle', 20, `/^-?\\d+\\.\\d°$/.test(document.getElementById('servo-angle').textContent)`);
+    await page.until('the trail', 60, 'viewer.robot.trail.n > 5');
+    const names = await page.ask(`document.getElementById('devices').innerText`);
+    for (const name of ['laser', 'servo', 'pose']) assert.ok(names.includes(name), names);
   },
 
   async 'it shows the map: as many patches and triangles as the daemon says'({ page }) {
@@ -182,7 +198,7 @@ const claims = {
   async 'the section slider takes the ceiling off, and puts it on again'({ page }) {
     await page.ask(`for (const id of ['laser', 'robot', 'trail']) if (document.getElementById(id).checked) document.getElementById(id).click();
       document.getElementById('backs').click()`);
-    const clip = { x: 60, y: 80, width: 800, height: 540, scale: 1 };
+    const clip = { x: 60, y: 80, width: 580, height: 460, scale: 1 };
     const shot = async () => (await page.call('Page.captureScreenshot', { format: 'png', clip })).data;
     const slide = (value) => page.ask(`(s => { s.value = ${value}; s.dispatchEvent(new Event('input')); })(document.getElementById('section'))`);
     await standing(page);
@@ -259,7 +275,9 @@ const claims = {
   },
 
   async 'it survives a restart of the daemon, and says how old the picture is meanwhile'(bed) {
-    const { page } = bed, before = await counts(page);
+    const { page } = bed;
+    await holds(page, 'the page has the map', await status());
+    const before = await counts(page);
     await end(bed.daemon);
     await page.until('the page says that the daemon is gone', 20, `/reconnecting, picture is/.test(document.getElementById('state-text').textContent)`);
     const meanwhile = await counts(page);
@@ -269,6 +287,30 @@ const claims = {
     await page.until('it is back', 20, `viewer.counts().map !== ${JSON.stringify(before.map)}`);
     await holds(page, 'the page has the new map', await standStill(60));
     await page.until('the panel says so', 10, `document.getElementById('state-text').textContent === 'paused'`);
+  },
+
+  async 'a replay has a transport: pause, seek, speed'(bed) {
+    await end(bed.daemon);
+    const file = readdirSync(dir).filter((name) => name.endsWith('.mcap')).sort()[0];
+    bed.daemon = start('facetd', '--config', replayConfig(), '--replay', join(dir, file));
+    await until('facetd replays', 30, async () => (await status().catch(() => null))?.replay);
+    const page = await bed.browser.open(address, 900, 500);
+    await page.until('the transport', 40, `!document.getElementById('transport').hidden && !document.getElementById('play').disabled`);
+    await page.ask(`document.getElementById('play').click()`);
+    await until('it stops', 20, async () => (await status()).replay.state === 'paused');
+    await page.ask(`(s => { s.value = 'max'; s.dispatchEvent(new Event('change')); })(document.getElementById('speed'))`);
+    await until('its speed is max', 20, async () => (await status()).replay.speed === 'max');
+    await page.ask(`(s => { s.value = 200; s.dispatchEvent(new Event('input')); s.dispatchEvent(new Event('change')); })(document.getElementById('seek'))`);
+    await until('it is there', 30, async () => {
+      const { replay } = await status();
+      return replay.state === 'paused' && Math.abs(replay.position - replay.begin - 0.2 * (replay.end - replay.begin)) < 0.5;
+    });
+    await page.until('the page has that map', 40, `viewer.counts().step === ${(await status()).step} && viewer.counts().drawn === ${(await status()).map_size.triangles}`);
+    await page.ask(`document.getElementById('play').click()`);
+    await until('it plays to the end', 60, async () => (await status()).replay.state === 'ended');
+    await holds(page, 'the page has the whole map', await status());
+    await page.close();
+    await end(bed.daemon);
   },
 };
 
@@ -282,7 +324,7 @@ async function main() {
     grantToken();
     bed.daemon = await startDaemon();
     bed.browser = new Browser();
-    bed.page = await bed.browser.open(address);
+    bed.page = await bed.browser.open(address, 1000, 640);
     for (const [claim, hold] of Object.entries(claims)) {
       const begun = Date.now();
       try {

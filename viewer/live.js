@@ -12,7 +12,9 @@ const matrixOf = (translation, rotation) => new Matrix4().compose(
   new Quaternion(rotation.x, rotation.y, rotation.z, rotation.w), new Vector3(1, 1, 1));
 
 export class Live {
-  constructor(token) {
+  // `moved(matrix)`: the robot's pose, each that comes.
+  constructor(token, moved) {
+    this.moved = moved;
     this.channels = new Map(); // id -> {topic, schemaName}
     this.frames = new Map(); // child -> {parent, matrix}
     this.scans = new Map(); // frame -> {ranges, start, step, intensities, at}
@@ -58,6 +60,8 @@ export class Live {
     if (schema === 'foxglove.PoseInFrame') this.base = matrixOf(message.pose.position, message.pose.orientation);
     else if (schema === 'foxglove.FrameTransforms') message.transforms.forEach((transform) => this.frame(transform));
     else this.scan(message);
+    const place = schema === 'foxglove.LaserScan' ? null : this.robot;
+    if (place) this.moved(place);
   }
 
   frame({ parent_frame_id: parent, child_frame_id: child, translation, rotation }) {

@@ -19,9 +19,19 @@ const query = new URLSearchParams(location.search), still = query.get('still') =
 const STALE_S = 2, CLICK_PIXELS = 5;
 
 ColorManagement.enabled = false; // display colours throughout: shader.js
-const renderer = new WebGLRenderer({ canvas: $('view'), antialias: true, alpha: true, powerPreference: 'high-performance' });
+const renderer = makeRenderer();
 renderer.outputColorSpace = LinearSRGBColorSpace;
 renderer.setClearAlpha(0);
+
+function makeRenderer() {
+  try {
+    return new WebGLRenderer({ canvas: $('view'), antialias: true, alpha: true, powerPreference: 'high-performance' });
+  } catch (error) {
+    $('state').dataset.state = 'lost';
+    $('state-text').textContent = 'this browser has no WebGL 2';
+    throw error;
+  }
+}
 
 let token = takeToken();
 const scene = new Scene(), map = new MapScene(), grid = new Grid(), robot = new Robot(), measure = new Measure();
@@ -41,7 +51,7 @@ const hooks = {
     reader = new FrameReader((type, payload) => take(type, payload));
     link.send(writeWant());
     link.send('?WATCH={"enable":true}');
-    if (!live && !still) live = new Live(token);
+    if (!live && !still) live = new Live(token, (place) => robot.moved(place));
   },
   bytes: (bytes) => reader.push(bytes),
   text: (text) => hear(JSON.parse(text)),

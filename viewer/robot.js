@@ -135,16 +135,16 @@ export class Robot {
     return made;
   }
 
+  moved({ elements: e }) {
+    this.trail.add(e[12], e[13], e[14] + 0.03);
+  }
+
   // Once a frame, from what is known now (live.js).
   update(live) {
     const place = live.robot;
     this.body.visible = !!place && this.shown.robot;
     this.trail.line.visible = this.shown.trail;
-    if (place) {
-      const e = place.elements;
-      this.body.matrix.copy(place);
-      this.trail.add(e[12], e[13], e[14] + 0.03);
-    }
+    if (place) this.body.matrix.copy(place);
     for (const { head, fan: shape } of this.heads.values()) head.visible = shape.visible = false;
     for (const { frame, place: at, scan } of live.scanners()) {
       if (!at) continue;

@@ -41,7 +41,7 @@ export class Transport {
     return ($('seek').value / 1000) * (this.replay.end - this.replay.begin);
   }
 
-  // `replay`: {state, begin, end, t, speed}, times in s; null when the daemon does not replay.
+  // `replay`: {state, begin, end, position, speed}, times in s; null when the daemon does not replay.
   show(replay, may) {
     this.replay = replay ?? null;
     this.at = performance.now();
@@ -67,9 +67,9 @@ export class Transport {
   // Between two messages the place is carried on by its speed.
   move() {
     if (!this.replay || this.dragging) return;
-    const { begin, end, t, state, speed } = this.replay;
+    const { begin, end, position, state, speed } = this.replay;
     const carried = state === 'playing' && speed !== 'max' ? ((performance.now() - this.at) / 1000) * speed : 0;
-    const place = Math.min(t + carried, end) - begin;
+    const place = Math.min(position + carried, end) - begin;
     $('played').textContent = clock(place);
     $('seek').value = end > begin ? (1000 * place) / (end - begin) : 0;
   }

@@ -571,13 +571,15 @@ static bool evict(struct web *web)
 
 static void tune(const struct web *web, int fd)
 {
-	const int size = web->site.config->listen.send_buffer, on = 1, idle_s = 60;
+	const int size = web->site.config->listen.send_buffer, on = 1, idle_s = 60, every_s = 15, probes = 4;
 
 	if (size > 0)
 		setsockopt(fd, SOL_SOCKET, SO_SNDBUF, &size, sizeof(size));
 	setsockopt(fd, IPPROTO_TCP, TCP_NODELAY, &on, sizeof(on));
 	setsockopt(fd, SOL_SOCKET, SO_KEEPALIVE, &on, sizeof(on)); /* one that is gone without a word ends by this */
 	setsockopt(fd, IPPROTO_TCP, TCP_KEEPIDLE, &idle_s, sizeof(idle_s));
+	setsockopt(fd, IPPROTO_TCP, TCP_KEEPINTVL, &every_s, sizeof(every_s));
+	setsockopt(fd, IPPROTO_TCP, TCP_KEEPCNT, &probes, sizeof(probes));
 }
 
 static void welcome(struct web *web, int fd, const struct sockaddr_storage *from)
@@ -912,6 +914,8 @@ static void list_protocols(struct web *web)
 
 static bool create_context(struct web *web, char error[320])
 {
+	/* Nobody is closed for not answering pings: one that does not read cannot, and may read again. */
+	static const lws_retry_bo_t patient = {0};
 	const struct config *config = web->site.config;
 	void *loops[] = {web->loop};
 	struct lws_context_creation_info info = {.port = CONTEXT_PORT_NO_LISTEN_SERVER,
@@ -927,7 +931,8 @@ static bool create_context(struct web *web, char error[320])
 	                                         .max_http_header_data = HEADERS_MAX,
 	                                         .server_string = "facetd",
 	                                         .vhost_name = "facetd",
-	                                         .alpn = "http/1.1"};
+	                                         .alpn = "http/1.1",
+	                                         .retry_and_idle_policy = &patient};
 
 	lws_set_log_level(0, NULL);
 	if (config->listen.has_tls) {

@@ -468,6 +468,7 @@ static void on_again(void *ctx)
 	struct daemon *d = ctx;
 
 	replay_lines_reset(&d->lines);
+	live_reset(d->live);
 	worker_reset(d->worker);
 }
 

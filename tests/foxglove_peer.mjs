@@ -213,6 +213,71 @@ function expectMeasured(name, { last, counts }) {
   for (const topic of ['/map', '/tf', '/pose', '/scan/laser', 'time']) assert.ok(counts[topic] > 20, `${name}: ${topic} ${counts[topic]}`);
 }
 
+// A replay, told and controlled in binary messages that the old client does not know.
+class Replayer {
+  scene = new Scene();
+  states = [];
+  statuses = [];
+  data = 0;
+  constructor(port) {
+    this.ws = new WebSocket(`ws://127.0.0.1:${port}/`, ['foxglove.sdk.v1']);
+    this.ws.on('message', (bytes, binary) => {
+      if (!binary) {
+        const message = JSON.parse(bytes);
+        if (message.op === 'serverInfo') this.info = message;
+        if (message.op === 'status') this.statuses.push(message.message);
+        if (message.op === 'advertise') this.ws.send('{"op":"subscribe","subscriptions":[{"id":0,"channelId":1},{"id":1,"channelId":2}]}');
+        return;
+      }
+      if (bytes[0] === 2) this.time = bytes.readBigUInt64LE(1);
+      if (bytes[0] === 5)
+        this.states.push({ state: bytes[1], time: bytes.readBigUInt64LE(2), speed: bytes.readFloatLE(10), seeked: bytes[14], name: bytes.subarray(19).toString() });
+      if (bytes[0] !== 1) return;
+      this.data++;
+      if (bytes.readUInt32LE(1) === 0) this.scene.take(JSON.parse(bytes.subarray(13)));
+    });
+  }
+  get state() { return this.states.at(-1); }
+  ask(pause, speed, seek, name) {
+    const bytes = Buffer.alloc(19 + name.length);
+    bytes[0] = 3;
+    bytes[1] = pause;
+    bytes.writeFloatLE(speed, 2);
+    bytes[6] = seek === null ? 0 : 1;
+    bytes.writeBigUInt64LE(seek ?? 0n, 7);
+    bytes.writeUInt32LE(name.length, 15);
+    bytes.write(name, 19);
+    this.ws.send(bytes);
+    return until(`the answer to ${name}`, 30, () => this.states.find((state) => state.name === name));
+  }
+}
+
+async function replayed(journal, port, map, points) {
+  const daemon = start(join(build, 'facetd'), ['--config', join(dir, 'facetd.yaml'), '--replay', journal]);
+  await until('the replay', 30, () => command('STATUS').catch(() => null));
+  const client = new Replayer(port);
+  await until('how the replay stands', 20, () => client.state);
+  assert.deepEqual(client.info.capabilities, ['time', 'playbackControl']);
+  const first = nanos(client.info.dataStartTime), last = nanos(client.info.dataEndTime);
+  assert.ok(last - first > 3000000000n, `a replay of ${last - first} ns`);
+  assert.equal((await client.ask(1, 1, null, 'stop')).state, 1);
+  const { time } = client;
+  await sleep(500);
+  assert.equal(client.time, time, 'time stands while it is stopped');
+  const jumped = await client.ask(1, 1, first + (last - first) / 2n, 'half');
+  assert.equal(jumped.state === 1 || jumped.state === 2, true);
+  await until('half of the drive', 60, () => client.scene.entities.size > 20);
+  const whole = client.scene.all;
+  await client.ask(0, 1000, first, 'again');
+  await until('the map to begin anew', 30, () => client.scene.all > whole);
+  await until('the end', 90, () => client.state.state === 3);
+  await until('the map of the drive', 60, () => client.scene.entities.size === map.patches && client.scene.triangles === map.triangles);
+  samePoints('replay', client.scene, points);
+  assert.deepEqual(client.statuses, []);
+  assert.ok(client.data > 20 && client.states.some((state) => state.seeked));
+  await end(daemon, 'SIGTERM');
+}
+
 async function main() {
   const port = await freePort(), file = join(dir, 'recorded.mcap'), socket = join(dir, 'facetd.sock');
   const status = () => command('STATUS'), patches = async () => (await status()).map_size.patches;
@@ -221,7 +286,7 @@ async function main() {
 
   start(join(build, 'facet'), ['simulate', 'building', '--endless', '--dir', dir, '--http', `127.0.0.1:${port}`]);
   await until('the simulator', 20, () => existsSync(join(dir, 'facetd.yaml')));
-  const daemon = start(join(build, 'facetd'), ['--config', join(dir, 'facetd.yaml')]);
+  const daemon = start(join(build, 'facetd'), ['--config', join(dir, 'facetd.yaml'), '--journal', join(dir, 'journal')]);
   await until('facetd', 30, () => existsSync(socket) && status().catch(() => null));
 
   const json = new Listener(port, 'foxglove.websocket.v1');
@@ -276,6 +341,7 @@ async function main() {
   samePoints('mcap-record', record.scene, points);
   await end(daemon, 'SIGTERM');
   await until('the clients to be closed', 10, () => Object.values(listeners).every((listener) => listener.closed));
+  await replayed(join(dir, 'journal.2'), port, map, points);
   console.log(`note: ${map.patches} patches, ${map.triangles} triangles, ${points.size} points held alike by ws-protocol ` +
     `(JSON ${json.scene.updates} updates, ${json.scene.deletions} deletions; protobuf ${binary.scene.updates}), mcap-record ` +
     `(${record.scene.updates}) and a client that stalled until ${behind.behind} steps behind (it cost ${behind.queued} bytes)`);

@@ -84,6 +84,7 @@ static const char *const names[] = {"foxglove.sdk.v1", "foxglove.websocket.v1", 
 const struct web_language foxglove_language = {
     .names = names,
     .kind = "foxglove",
+    .ping_first = true,
     .open = open_listener,
     .hear = hear,
     .next = next,

@@ -43,8 +43,9 @@
 #define CLOSE_S         2  /* for a client that is told to go */
 #define SNAPSHOT_S      60 /* for a snapshot to be made */
 #define HEADERS_MAX     4096
-#define SETTLE_NS       10000000ll /* after the handshake; see web_language.open */
-#define TICK_MS         1000       /* doors that were closed for want of descriptors */
+#define SETTLE_NS       10000000ll   /* after the handshake; see web_language.open */
+#define PONG_NS         2000000000ll /* the longest a client is waited for that was pinged */
+#define TICK_MS         1000         /* doors that were closed for want of descriptors */
 #define PROTOCOLS_MAX   16
 #define RX_BYTES        4096
 #define CERTIFICATE_MAX (256u << 10)
@@ -74,7 +75,8 @@ struct web_connection {
 	bool begun, begun_text; /* a message */
 	bool asked;             /* to be called when there is room */
 	int64_t settle_ns;
-	struct buffer in; /* a message that is coming */
+	bool pings, pinged; /* it is to be pinged; it was, and has not answered */
+	struct buffer in;   /* a message that is coming */
 	bool in_text;
 	int close_code;
 	bool said_close;
@@ -373,7 +375,8 @@ static int on_established(struct web_connection *c, const struct lws_protocols *
 	enter(c, STAGE_SPEAKS);
 	lws_set_timeout(c->wsi, NO_PENDING_TIMEOUT, 0);
 	c->language = speaker->language;
-	c->settle_ns = now(web) + SETTLE_NS;
+	c->pings = c->language->ping_first;
+	c->settle_ns = now(web) + (c->pings ? PONG_NS : SETTLE_NS);
 	if (++web->clients > (size_t)web->site.config->listen.clients + DOORSTEP_MAX)
 		return -1;
 	if (web->clients > (size_t)web->site.config->listen.clients) {
@@ -383,7 +386,26 @@ static int on_established(struct web_connection *c, const struct lws_protocols *
 	c->state = c->language->open(speaker->ctx, c, protocol->id == 0 ? speaker->language->names[0] : protocol->name);
 	if (!c->state)
 		web_close(c, 1011, "out of memory");
+	if (c->pings)
+		ask_for_room(c);
 	set_timer(web);
+	return 0;
+}
+
+static int ping(struct web_connection *c)
+{
+	c->pings = false;
+	c->pinged = true;
+	c->web->out[LWS_PRE] = '?'; /* of an empty one's answer libwebsockets says nothing */
+	return lws_write(c->wsi, c->web->out + LWS_PRE, 1, LWS_WRITE_PING) < 0 ? -1 : 0;
+}
+
+static int on_pong(struct web_connection *c)
+{
+	if (c->pinged && c->settle_ns)
+		c->settle_ns = now(c->web) + SETTLE_NS;
+	c->pinged = false;
+	set_timer(c->web);
 	return 0;
 }
 
@@ -416,6 +438,8 @@ static int say_piece(struct web_connection *c, int64_t t_ns)
 
 	if (c->close_code && !c->begun)
 		return close_now(c);
+	if (c->pings)
+		return ping(c);
 	if (!c->state || t_ns < c->settle_ns)
 		return 0;
 	n = c->language->next(c->state, web->out + LWS_PRE, WEB_PIECE_MAX, t_ns, &piece);
@@ -509,6 +533,7 @@ static int on_lws(struct lws *wsi, enum lws_callback_reasons reason, void *user,
 	case LWS_CALLBACK_ESTABLISHED:
 	case LWS_CALLBACK_SERVER_WRITEABLE:
 	case LWS_CALLBACK_RECEIVE:
+	case LWS_CALLBACK_RECEIVE_PONG:
 	case LWS_CALLBACK_CLOSED:
 		c = lws_get_opaque_user_data(wsi);
 		break;
@@ -541,6 +566,8 @@ static int on_lws(struct lws *wsi, enum lws_callback_reasons reason, void *user,
 		return on_room(c);
 	case LWS_CALLBACK_RECEIVE:
 		return on_heard(c, in, len);
+	case LWS_CALLBACK_RECEIVE_PONG:
+		return on_pong(c);
 	default: /* CLOSED */
 		leave_language(c);
 		return 0;

@@ -37,6 +37,9 @@ struct web_piece {
 struct web_language {
 	const char *const *names; /* subprotocols, NULL behind the last */
 	const char *kind;         /* in STATUS */
+	/* Its clients may begin to listen only a moment after the handshake, and a loaded machine makes that moment long: it is
+	 * first asked for bytes when the client has answered a ping, or has not within two seconds. */
+	bool ping_first;
 	/* Somebody connected and agreed on `name`, which stays. NULL when memory is out: closed, 1011. It is first asked for
 	 * bytes in a later turn of the loop, some milliseconds after the handshake (some clients listen no sooner). */
 	void *(*open)(void *ctx, struct web_connection *, const char *name);

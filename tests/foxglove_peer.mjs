@@ -53,15 +53,26 @@ const freePort = () => new Promise((done) => {
   });
 });
 
-// One command over the unix socket; its answer.
-const command = (word) => new Promise((done, fail) => {
+// One command over the unix socket; its answer. On a loaded machine connections that were ended may still be counted.
+async function command(word) {
+  for (let tries = 0; ; tries++) {
+    try {
+      return await commandOnce(word);
+    } catch (error) {
+      if (tries === 20) throw error;
+      await sleep(200);
+    }
+  }
+}
+
+const commandOnce = (word) => new Promise((done, fail) => {
   const socket = connect(join(dir, 'facetd.sock'));
   let text = '';
   socket.on('error', fail).on('data', (data) => {
     text += data;
     const answer = text.split('\n').slice(0, -1).map((line) => JSON.parse(line)).find((one) => one.class !== 'VERSION');
     if (!answer) return;
-    socket.destroy();
+    socket.end();
     done(answer);
   });
   socket.write(`?${word}\n`);

@@ -1,5 +1,5 @@
-// Makes docs/viewer.png and docs/viewer_phone.png anew: node docs/viewer_pictures.mjs, after `make`. Two minutes: the robot of the demo
-// building drives there and most of the way back, in sight of real Chromium.
+// Makes docs/viewer.png and docs/viewer_phone.png anew: node docs/viewer_pictures.mjs [URL], after `make`. Two minutes: the robot of the
+// demo building (or the one of a facetd that runs at URL) drives there and most of the way back, in sight of real Chromium.
 import { spawn } from 'node:child_process';
 import { mkdtempSync, rmSync } from 'node:fs';
 import { tmpdir } from 'node:os';
@@ -8,10 +8,10 @@ import { fileURLToPath } from 'node:url';
 import { Browser, sleep, until } from '../tests/viewer_browser.mjs';
 
 const docs = dirname(fileURLToPath(import.meta.url)), root = join(docs, '..');
-const dir = mkdtempSync(join(tmpdir(), 'viewer-pictures-')), address = 'http://127.0.0.1:7881/';
-const ROWS = 4200;
+const dir = mkdtempSync(join(tmpdir(), 'viewer-pictures-')), address = process.argv[2] ?? 'http://127.0.0.1:7881/';
+const ROWS = 4500;
 
-const devices = spawn(join(root, 'build/facet'), ['simulate', 'building', '--endless', '--dir', join(dir, 'd'), '--http', '127.0.0.1:7881',
+const devices = process.argv[2] ? null : spawn(join(root, 'build/facet'), ['simulate', 'building', '--endless', '--dir', join(dir, 'd'), '--http', '127.0.0.1:7881',
   '--', join(root, 'build/facetd')], { stdio: 'ignore' });
 const browser = new Browser();
 try {
@@ -30,7 +30,7 @@ try {
   await phone.picture(join(docs, 'viewer_phone.png'));
 } finally {
   await browser.end();
-  devices.kill('SIGTERM');
-  await new Promise((done) => devices.once('exit', done));
+  devices?.kill('SIGTERM');
+  if (devices) await new Promise((done) => devices.once('exit', done));
   rmSync(dir, { recursive: true, force: true });
 }

@@ -5,7 +5,6 @@ import { Link } from './link.js';
 
 const WANTED = ['foxglove.LaserScan', 'foxglove.FrameTransforms', 'foxglove.PoseInFrame'];
 const MESSAGE = 1;
-const STALE_MS = 1500; // a profile that was not renewed is not drawn any more
 
 const matrixOf = (translation, rotation) => new Matrix4().compose(
   new Vector3(translation.x, translation.y, translation.z),
@@ -20,6 +19,7 @@ export class Live {
     this.scans = new Map(); // frame -> {ranges, start, step, intensities, at}
     this.base = null; // the robot's pose, where no transform tells it
     this.profiles = 0;
+    this.patienceMs = 1500; // a profile that was not renewed for so long is not drawn any more
     this.version = 0; // one more with every message
     this.decoder = new TextDecoder();
     this.link = new Link('/', ['foxglove.sdk.v1'], token, {
@@ -97,7 +97,7 @@ export class Live {
     return [...this.frames.keys()].filter((frame) => frame.startsWith('laser')).map((frame) => {
       const scan = this.scans.get(frame);
       return { frame, place: this.place(frame), tilt: this.tiltOf(frame),
-        scan: scan && now - scan.at < STALE_MS ? scan : null };
+        scan: scan && now - scan.at < this.patienceMs ? scan : null };
     });
   }
 

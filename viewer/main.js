@@ -16,7 +16,7 @@ import { finish, stillCounts } from './still.js';
 import { Transport } from './transport.js';
 
 const query = new URLSearchParams(location.search), still = query.get('still') === '1';
-const STALE_S = 2, CLICK_PIXELS = 5;
+const STALE_S = 2, FRESH_S = 1.5, CLICK_PIXELS = 5;
 
 ColorManagement.enabled = false; // display colours throughout: shader.js
 const renderer = makeRenderer();
@@ -225,7 +225,7 @@ function wireUp() {
 
 // ---- what is seen ----
 
-let before = performance.now(), frames = 0, second = before, received = 0, pictureAt = null, committed = 0, firstMs = null;
+let before = performance.now(), frames = 0, second = before, received = 0, pictureAt = null, committed = 0, firstMs = null, slow = 0;
 
 function resize() {
   renderer.setPixelRatio(still ? 1 : Math.min(devicePixelRatio, 2));
@@ -244,7 +244,7 @@ function tellState(now) {
   if (shut) panel.state('lost', 'a token is needed');
   else if (!link.open) panel.state('lost', age === null ? 'no daemon, trying' : `reconnecting, picture is ${span(age)} old`);
   else if (age === null) panel.state('wait', 'connecting');
-  else if (age > STALE_S) panel.state('wait', `picture is ${span(age)} old`);
+  else if (age > STALE_S + slow) panel.state('wait', `picture is ${span(age)} old`);
   else if (status?.paused) panel.state('paused', 'paused');
   else if (status?.replay) panel.state('live', `replay, ${status.replay.state}`);
   else panel.state('live', 'live');
@@ -303,6 +303,8 @@ function draw(dt, now) {
 function frame(now) {
   requestAnimationFrame(frame);
   frames++;
+  slow = 2 * (now - before) / 1000; // a page that is late itself calls nothing old for that
+  if (live) live.patienceMs = 1000 * (FRESH_S + slow);
   draw(Math.min((now - before) / 1000, 0.25), now);
   before = now;
   panel.servo(live?.scanners()[0]?.tilt ?? null);

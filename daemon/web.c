@@ -103,6 +103,7 @@ struct web {
 	int speaks[PROTOCOLS_MAX]; /* which of them, by protocol */
 	uv_poll_t door;
 	uv_timer_t timer, tick;
+	int64_t armed_ns; /* when `timer` comes; INT64_MAX: it does not */
 	bool open, polling, stopped;
 	struct web_connection *connections;
 	size_t count, clients; /* all; of those that speak */
@@ -357,7 +358,7 @@ static int on_upgrade(struct web_connection *c, const char *to)
 
 /* Languages */
 
-static void set_timer(struct web *web);
+static void arm(struct web_connection *c);
 
 static void ask_for_room(struct web_connection *c)
 {
@@ -388,7 +389,7 @@ static int on_established(struct web_connection *c, const struct lws_protocols *
 		web_close(c, 1011, "out of memory");
 	if (c->pings)
 		ask_for_room(c);
-	set_timer(web);
+	arm(c);
 	return 0;
 }
 
@@ -405,7 +406,7 @@ static int on_pong(struct web_connection *c)
 	if (c->pinged && c->settle_ns)
 		c->settle_ns = now(c->web) + SETTLE_NS;
 	c->pinged = false;
-	set_timer(c->web);
+	arm(c);
 	return 0;
 }
 
@@ -469,7 +470,7 @@ static int on_room(struct web_connection *c)
 		return -1;
 	if (n > 0)
 		ask_for_room(c);
-	set_timer(c->web);
+	arm(c);
 	return 0;
 }
 
@@ -499,7 +500,7 @@ static int on_heard(struct web_connection *c, const void *data, size_t len)
 		if (last)
 			buffer_finish(&c->in);
 	}
-	set_timer(c->web);
+	arm(c);
 	return 0;
 }
 
@@ -676,11 +677,9 @@ static void on_tick(uv_timer_t *tick)
 
 static int64_t deadline_of(const struct web_connection *c)
 {
-	const int64_t deadline_ns = c->language->deadline && c->state ? c->language->deadline(c->state) : INT64_MAX;
-
-	if (c->asked || !c->state)
+	if (c->asked || !c->state || !c->language->deadline)
 		return INT64_MAX;
-	return c->settle_ns > deadline_ns ? deadline_ns < INT64_MAX ? c->settle_ns : INT64_MAX : deadline_ns;
+	return c->language->deadline(c->state);
 }
 
 static void on_timer(uv_timer_t *timer)
@@ -688,37 +687,32 @@ static void on_timer(uv_timer_t *timer)
 	struct web *web = timer->data;
 	const int64_t t_ns = now(web);
 
+	web->armed_ns = INT64_MAX;
 	for (struct web_connection *c = web->connections; c; c = c->next) {
-		if (c->language && c->settle_ns && t_ns >= c->settle_ns) {
+		if (!c->language)
+			continue;
+		if (c->settle_ns && t_ns >= c->settle_ns) {
 			c->settle_ns = 0;
 			ask_for_room(c);
-		} else if (c->language && deadline_of(c) <= t_ns) {
+		} else if (!c->settle_ns && deadline_of(c) <= t_ns) {
 			ask_for_room(c);
 		}
+		arm(c);
 	}
-	set_timer(web);
 }
 
-/* One timer for the nearest deadline of all languages. */
-static void set_timer(struct web *web)
+/* One timer for the nearest deadline of all languages; it may come too early, when who set it changed his mind. */
+static void arm(struct web_connection *c)
 {
-	int64_t deadline_ns = INT64_MAX;
-	const int64_t t_ns = now(web);
+	struct web *web = c->web;
+	const int64_t deadline_ns = c->settle_ns ? c->settle_ns : deadline_of(c);
+	int64_t wait_ns;
 
-	if (web->stopped)
+	if (web->stopped || deadline_ns >= web->armed_ns)
 		return;
-	for (const struct web_connection *c = web->connections; c; c = c->next) {
-		int64_t next_ns = INT64_MAX;
-
-		if (c->language)
-			next_ns = c->settle_ns ? c->settle_ns : deadline_of(c);
-		deadline_ns = next_ns < deadline_ns ? next_ns : deadline_ns;
-	}
-	if (deadline_ns == INT64_MAX)
-		uv_timer_stop(&web->timer);
-	else
-		uv_timer_start(&web->timer, on_timer,
-		               deadline_ns <= t_ns ? 1 : (uint64_t)((deadline_ns - t_ns + 999999) / 1000000), 0);
+	web->armed_ns = deadline_ns;
+	wait_ns = deadline_ns - now(web);
+	uv_timer_start(&web->timer, on_timer, wait_ns <= 0 ? 1 : (uint64_t)((wait_ns + 999999) / 1000000), 0);
 }
 
 static void on_snapshot(void *ctx)
@@ -897,6 +891,7 @@ struct web *web_create(uv_loop_t *loop, const struct config *config, struct publ
 	web->site.config = config;
 	web->site.host = &web->host;
 	web->listener.fd = -1;
+	web->armed_ns = INT64_MAX;
 	if (config->listen.token_file[0])
 		r = web_token_read(config->listen.token_file, web->site.secret, error);
 	if (r == 0 && !check_tls(web, error))

@@ -861,6 +861,8 @@ static bool begin_recorders(struct daemon *d, const char *config_text)
 	if (r == 0 && text.error == 0)
 		d->recorders = recorders_create(&d->loop, d->config, (const char *)text.data, &host);
 	buffer_finish(&text);
+	if (d->recorders)
+		recorders_publish(d->recorders, d->publisher, d->live);
 	return d->recorders != NULL;
 }
 

@@ -30,7 +30,17 @@
 #define KEEP_PARTS    4                   /* files that `keep` holds where max_size says nothing */
 #define RECORDER_NAME "facetd-recorder"
 
-enum item_kind { ITEM_BEGIN, ITEM_RECORD, ITEM_TICK, ITEM_SKIP, ITEM_CLOCK, ITEM_EVENT, ITEM_CONTROL, ITEM_END };
+enum item_kind {
+	ITEM_BEGIN,
+	ITEM_RECORD,
+	ITEM_TICK,
+	ITEM_SKIP,
+	ITEM_CLOCK,
+	ITEM_EVENT,
+	ITEM_CONTROL,
+	ITEM_MESSAGE,
+	ITEM_END
+};
 
 struct item {
 	enum item_kind kind;
@@ -73,6 +83,7 @@ struct recorder {
 	bool rotate;     /* the file is long or old enough */
 	bool begun;      /* once at least */
 	unsigned begins; /* in the queue */
+	bool fresh;      /* ... or was since recorder_begun */
 	int64_t retry_ns;
 	uint64_t session;
 	uint32_t part;
@@ -111,6 +122,7 @@ static void push(struct recorder *r, struct item item, const void *data, size_t 
 		buffer_append(&r->queue, &item, sizeof(item));
 		buffer_append(&r->queue, data, len);
 		r->begins += item.kind == ITEM_BEGIN;
+		r->fresh |= item.kind == ITEM_BEGIN;
 	}
 	if (r->queue.len > r->status.queued_peak)
 		r->status.queued_peak = r->queue.len;
@@ -201,6 +213,22 @@ void recorder_event(struct recorder *r, const char *json, size_t len)
 void recorder_control(struct recorder *r, const char *json, size_t len)
 {
 	push(r, (struct item){.kind = ITEM_CONTROL}, json, len);
+}
+
+void recorder_message(struct recorder *r, enum foxglove_schema schema, const void *data, size_t len)
+{
+	push(r, (struct item){.kind = ITEM_MESSAGE, .value = schema}, data, len);
+}
+
+bool recorder_begun(struct recorder *r)
+{
+	bool begun;
+
+	pthread_mutex_lock(&r->lock);
+	begun = r->fresh;
+	r->fresh = false;
+	pthread_mutex_unlock(&r->lock);
+	return begun;
 }
 
 bool recorder_notice(struct recorder *r, struct recorder_notice *ret)
@@ -623,6 +651,8 @@ static int put(struct recorder *r, const struct item *item, const char *data)
 		return recording_put_clock(w, item->value);
 	case ITEM_EVENT:
 		return recording_put_event(w, data, item->len);
+	case ITEM_MESSAGE:
+		return recording_put_message(w, (enum foxglove_schema)item->value, data, item->len);
 	default:
 		return recording_put_control(w, data, item->len);
 	}

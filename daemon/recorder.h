@@ -51,6 +51,9 @@ void recorder_skip(struct recorder *, uint64_t number, const char *reason);
 void recorder_clock(struct recorder *, int64_t ahead_ns);
 void recorder_event(struct recorder *, const char *json, size_t len);
 void recorder_control(struct recorder *, const char *json, size_t len);
+void recorder_message(struct recorder *, enum foxglove_schema, const void *data, size_t len); /* protobuf */
+/* A file was begun since the last call: what is published comes whole again. */
+bool recorder_begun(struct recorder *);
 
 /* What is worth a line of log and an event: a file began, ended, could not be written. False: nothing. */
 struct recorder_notice {

@@ -14,6 +14,7 @@ struct recorders {
 	struct recorders_host host;
 	uv_async_t ready;
 	struct recorder *recorder[RECORDERS]; /* NULL: none */
+	struct recorded_messages *messages;   /* NULL: not wanted */
 	bool stopped;
 };
 
@@ -69,6 +70,8 @@ void recorders_stop(struct recorders *all)
 	if (!all || all->stopped)
 		return;
 	all->stopped = true;
+	recorded_messages_destroy(all->messages);
+	all->messages = NULL;
 	for (int i = 0; i < RECORDERS; i++) {
 		recorder_destroy(all->recorder[i]);
 		all->recorder[i] = NULL;
@@ -116,12 +119,31 @@ void recorders_record(struct recorders *all, const struct record *record)
 			recorder_record(all->recorder[i], record);
 }
 
+void recorders_publish(struct recorders *all, struct publisher *publisher, const struct live *live)
+{
+	if (all->config->record.messages && all->recorder[FOLDER])
+		all->messages = recorded_messages_create(publisher, live);
+}
+
+static void put_message(void *ctx, enum foxglove_schema schema, const struct buffer *message)
+{
+	struct recorders *all = ctx;
+
+	if (!message->error)
+		recorder_message(all->recorder[FOLDER], schema, message->data, message->len);
+}
+
 void recorders_tick(struct recorders *all, int64_t log_ns)
 {
 	begin(all, log_ns, false);
 	for (int i = 0; i < RECORDERS; i++)
 		if (all->recorder[i])
 			recorder_tick(all->recorder[i], log_ns);
+	if (!all->messages)
+		return;
+	if (recorder_begun(all->recorder[FOLDER]))
+		recorded_messages_again(all->messages);
+	recorded_messages_tick(all->messages, log_ns, put_message, all);
 }
 
 void recorders_skip(struct recorders *all, uint64_t number, const char *reason)

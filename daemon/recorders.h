@@ -5,6 +5,7 @@
 
 #include <uv.h>
 
+#include "daemon/recorded_messages.h"
 #include "daemon/recorder.h"
 
 #define RECORDERS_STREAMS 2 /* at once; a further client is refused */
@@ -24,6 +25,8 @@ struct recorders;
 /* The folder's begins at once where the configuration has one. `config_text` is copied. NULL when memory or threads are out. */
 struct recorders *recorders_create(uv_loop_t *, const struct config *, const char *config_text,
                                    const struct recorders_host *);
+/* With record.messages: what is published goes into the folder's recording. Both are borrowed till recorders_stop. */
+void recorders_publish(struct recorders *, struct publisher *, const struct live *);
 /* Ends them in order; the loop then still has a handle to close, after which destroy. */
 void recorders_stop(struct recorders *);
 void recorders_destroy(struct recorders *);

@@ -55,6 +55,7 @@ struct recording_writer {
 		    own; /* channels: facetd.bytes.v1, what was written, and what came in the device's own encoding */
 	} device[CONFIG_DEVICES_MAX];
 	int event, control, tick, state, json_schema;
+	int published[FOXGLOVE_SCHEMAS]; /* 0: not yet */
 };
 
 static int channel(struct recording_writer *w, int schema, const char *encoding, const char *device,
@@ -275,6 +276,37 @@ int recording_put_skip(struct recording_writer *w, uint64_t number, const char *
 int recording_put_clock(struct recording_writer *w, int64_t ahead_ns)
 {
 	return put_json(w, json_pack("{s:s, s:I}", "class", "CLOCK", "ahead_ns", (json_int_t)ahead_ns));
+}
+
+/* Channels of published messages are there when the first one comes: most recordings have none. */
+static int published_channel(struct recording_writer *w, enum foxglove_schema which)
+{
+	static const char *const topic[] = {[FOXGLOVE_SCENE_UPDATE] = "/map",
+	                                    [FOXGLOVE_LASER_SCAN] = "/scan",
+	                                    [FOXGLOVE_FRAME_TRANSFORMS] = "/tf",
+	                                    [FOXGLOVE_POSE_IN_FRAME] = "/robot/pose",
+	                                    [FOXGLOVE_LOG] = "/log"};
+	struct buffer schema = {0};
+	int r;
+
+	foxglove_schema_protobuf(&schema, which);
+	r = schema.error
+	        ? schema.error
+	        : mcap_writer_schema(w->mcap, foxglove_schema_name(which), "protobuf", schema.data, schema.len);
+	buffer_finish(&schema);
+	return r < 0 ? r : mcap_writer_channel(w->mcap, r, topic[which], "protobuf", NULL, 0);
+}
+
+int recording_put_message(struct recording_writer *w, enum foxglove_schema which, const void *data, size_t len)
+{
+	if (w->published[which] == 0) {
+		int r = published_channel(w, which);
+
+		if (r < 0)
+			return r;
+		w->published[which] = r;
+	}
+	return put(w, w->published[which], w->log_ns, NULL, 0, data, len);
 }
 
 int recording_end(struct recording_writer *w, const char *reason)

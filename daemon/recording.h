@@ -21,6 +21,7 @@
 
 #include "config/config.h"
 #include "core/mcap.h"
+#include "daemon/foxglove_schema.h"
 #include "drivers/driver.h"
 
 /* Where a list begins: at the birth of a map, or in the middle of one. */
@@ -61,6 +62,8 @@ int recording_put_skip(struct recording_writer *, uint64_t number, const char *r
 int recording_put_clock(struct recording_writer *, int64_t ahead_ns);
 int recording_put_event(struct recording_writer *, const char *json, size_t len);
 int recording_put_control(struct recording_writer *, const char *json, size_t len);
+/* What was published, for others (record.messages); readers of ours pass it over. */
+int recording_put_message(struct recording_writer *, enum foxglove_schema, const void *data, size_t len);
 /* An orderly end, with its reason ("ended", "rotated", ...), the summary and the footer. */
 int recording_end(struct recording_writer *, const char *reason);
 

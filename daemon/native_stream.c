@@ -42,11 +42,28 @@ size_t native_stream_queued(const struct native_stream *stream)
 
 #define NO_FRAME SIZE_MAX
 
+/* The open frame, all of which is in `out`, takes no more: the times and versions that its patches share make it a tenth
+ * shorter by zstd. One that cannot be packed goes as it is. */
+static void close_frame(struct native_stream *stream)
+{
+	const size_t at = stream->open_at, len = stream->out_len - at;
+	struct buffer packed = {0};
+
+	stream->open_at = NO_FRAME;
+	if (at == NO_FRAME || !stream->packer)
+		return;
+	if (native_put_packed(stream->packer, &packed, stream->out + at, len) == 0 && packed.len < len) {
+		memcpy(stream->out + at, packed.data, packed.len);
+		stream->out_len = at + packed.len;
+	}
+	buffer_finish(&packed);
+}
+
 /* What is in `small` comes next. */
 static void send_small(struct native_stream *stream)
 {
 	stream->small_at = 0;
-	stream->open_at = NO_FRAME;
+	close_frame(stream);
 	if (stream->small.error)
 		stream->broken = true;
 }
@@ -183,7 +200,7 @@ static void append(struct native_stream *stream, const uint8_t *bytes, size_t n)
 	stream->out_len += n;
 }
 
-static void fill(struct publisher_client *client, int64_t t_ns)
+static void gather(struct publisher_client *client, int64_t t_ns)
 {
 	struct native_stream *stream = client->stream;
 
@@ -206,6 +223,12 @@ static void fill(struct publisher_client *client, int64_t t_ns)
 			stream->source_left -= n;
 		}
 	}
+}
+
+static void fill(struct publisher_client *client, int64_t t_ns)
+{
+	gather(client, t_ns);
+	close_frame(client->stream);
 }
 
 /* The rate */
@@ -275,7 +298,11 @@ void publisher_ping(struct publisher_client *client)
 
 void native_stream_want(struct publisher_client *client, const struct native_want *want)
 {
+	struct sheets *sheets = &client->publisher->sheets;
+	const uint8_t both = NATIVE_WANT_CODED | NATIVE_WANT_ZSTD;
+
 	client->stream->bytes_per_s = want->bytes_per_s;
+	client->stream->packer = (want->flags & both) == both ? sheets_packer(sheets) : NULL;
 	client->form = want->flags & NATIVE_WANT_CODED  ? PUBLISHER_CODED
 	               : want->flags & NATIVE_WANT_ZSTD ? PUBLISHER_PACKED
 	                                                : PUBLISHER_NATIVE;

@@ -13,11 +13,12 @@ struct native_stream {
 	size_t small_at;
 	const uint8_t *source; /* of what a walk handed out */
 	size_t source_left;
-	struct buffer json;       /* messages that wait for their turn */
-	uint32_t bytes_per_s;     /* 0: all */
-	int64_t next_ns;          /* not before then, by that rate */
-	bool reason_sent, broken; /* broken: no memory even for a small frame */
-	size_t open_at;           /* in `out`: a frame of coded patches that takes more of them */
+	struct buffer json;           /* messages that wait for their turn */
+	uint32_t bytes_per_s;         /* 0: all */
+	int64_t next_ns;              /* not before then, by that rate */
+	bool reason_sent, broken;     /* broken: no memory even for a small frame */
+	size_t open_at;               /* in `out`: a frame of coded patches that takes more of them */
+	struct native_packer *packer; /* of such frames, borrowed; NULL: they go as they are */
 	size_t out_at, out_len;
 	uint8_t out[STREAM_OUT_BYTES];
 };

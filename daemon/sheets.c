@@ -49,11 +49,16 @@ static void form_drop(struct sheets *s, struct form *form)
 	form_unref(form);
 }
 
-static void pack(struct sheets *s, const struct sheet *sheet)
+struct native_packer *sheets_packer(struct sheets *s)
 {
 	if (!s->packer)
 		s->packer = native_packer_create();
-	if (s->packer)
+	return s->packer;
+}
+
+static void pack(struct sheets *s, const struct sheet *sheet)
+{
+	if (sheets_packer(s))
 		native_put_packed(s->packer, &s->scratch, sheet->bytes, sheet->len);
 	else
 		s->scratch.error = -ENOMEM;

@@ -56,6 +56,8 @@ struct sheets {
 void sheets_clear(struct sheets *);  /* forgets every entry */
 void sheets_finish(struct sheets *); /* and the memory */
 
+struct native_packer *sheets_packer(struct sheets *); /* made when it is first asked for; NULL: memory is out */
+
 /* NULL when memory is out. References: 1. */
 struct sheet *sheet_create(struct sheets *, const struct patch *, uint32_t faces_raw);
 void sheet_unref(struct sheets *, struct sheet *); /* of NULL: nothing */

@@ -32,8 +32,7 @@ static double level_m2(const struct facet_patch *patch, double cell_m)
 	for (uint32_t t = 0; t < info.triangles; t++, triangle += 3) {
 		double normal[3];
 		cross(vertex + 3 * triangle[0], vertex + 3 * triangle[1], vertex + 3 * triangle[2], normal);
-		const double area =
-		    sqrt(normal[0] * normal[0] + normal[1] * normal[1] + normal[2] * normal[2]) / 2;
+		const double area = sqrt(normal[0] * normal[0] + normal[1] * normal[1] + normal[2] * normal[2]) / 2;
 		if (normal[2] > 2 * area * 0.95)
 			sum += area;
 	}
@@ -52,7 +51,8 @@ static void show(struct facet *facet, const struct facet_event *event)
 	for (size_t i = 0; i < n; i++)
 		level += level_m2(patch[i], map.cell_m);
 	printf("step %llu: %zu patches changed, %zu removed%s; %zu in all, %.1f m2 level\n",
-	       (unsigned long long)event->step, event->changed, event->removed, event->reset ? ", a new map" : "", n, level);
+	       (unsigned long long)event->step, event->changed, event->removed, event->reset ? ", a new map" : "", n,
+	       level);
 	fflush(stdout);
 }
 

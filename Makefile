@@ -183,6 +183,8 @@ soak: all tests
 	@echo 'an hour of chaos in virtual time:'
 	@$(B)/tests/test_chaos 3600
 	@tests/soak $(B)
+	@echo '200 kills while recording:'
+	@FACET_BUILD=$(B) tests/e2e_recorded_killed.sh 200
 
 FUZZ_SECONDS ?= 300
 fuzz:

@@ -69,7 +69,10 @@ said = theirs["indexed"]["statistics"]
 assert int(said["messages"]) == ours["messages"] and said["chunks"] == ours["chunks"], said
 assert said["channels"] == len(ours["channels"]) and said["attachments"] == len(ours["attachments"]) == 1, said
 assert theirs["indexed"]["attachments"][0][0] == "facetd.yaml" and theirs["indexed"]["metadata"][0][0] == "facetd", "attachment, metadata"
-print(f"note: {name}: {ours['messages']} messages in {ours['chunks']} chunks, the same for @mcap/core's two readers")
+published = sum(c["messages"] for c in ours["channels"] if c["encoding"] == "protobuf")
+assert theirs["indexed"]["decoded"] == published, "messages in Foxglove's schemas"
+shown = f", {published} published, {theirs['indexed']['entities']} patches with {theirs['indexed']['triangles']} triangles at its end" if published else ""
+print(f"note: {name}: {ours['messages']} messages in {ours['chunks']} chunks, the same for @mcap/core's two readers{shown}")
 PYTHON
 done
 exit $failed

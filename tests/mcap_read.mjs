@@ -10,6 +10,9 @@ const { McapIndexedReader, McapStreamReader } = require("@mcap/core");
 const { FileHandleReadable } = require("@mcap/nodejs");
 const { loadDecompressHandlers } = require("@mcap/support");
 
+const protobuf = require("protobufjs");
+const descriptor = require("protobufjs/ext/descriptor");
+
 const decompressHandlers = await loadDecompressHandlers();
 
 function tally() {
@@ -25,11 +28,40 @@ function count(t, topic, message) {
   t.end = message.logTime;
 }
 
+// What was published, read by the schemas that the file carries: counts, and the entities that a viewer would show at the end.
+const decoders = new Map();
+function decode(reader, channel, data) {
+  const schema = reader.schemasById.get(channel.schemaId);
+  if (!decoders.has(schema.id)) {
+    const root = protobuf.Root.fromDescriptor(descriptor.FileDescriptorSet.decode(schema.data));
+    decoders.set(schema.id, root.lookupType(schema.name));
+  }
+  return decoders.get(schema.id).decode(data);
+}
+
+function show(scene, update) {
+  for (const deletion of update.deletions) {
+    if (deletion.type === 1) scene.clear();
+    else scene.delete(deletion.id);
+  }
+  for (const entity of update.entities) scene.set(entity.id, entity.triangles.reduce((n, list) => n + list.indices.length / 3, 0));
+}
+
 async function indexed() {
   const handle = await open(file, "r");
   const reader = await McapIndexedReader.Initialize({ readable: new FileHandleReadable(handle), decompressHandlers });
-  const t = tally();
-  for await (const message of reader.readMessages()) count(t, reader.channelsById.get(message.channelId).topic, message);
+  const t = tally(), scene = new Map();
+  t.decoded = 0;
+  for await (const message of reader.readMessages()) {
+    const channel = reader.channelsById.get(message.channelId);
+    count(t, channel.topic, message);
+    if (channel.messageEncoding !== "protobuf") continue;
+    const decoded = decode(reader, channel, message.data);
+    t.decoded++;
+    if (channel.topic === "/map") show(scene, decoded);
+  }
+  t.entities = scene.size;
+  t.triangles = [...scene.values()].reduce((a, b) => a + b, 0);
   t.statistics = {
     messages: reader.statistics.messageCount,
     chunks: reader.statistics.chunkCount,

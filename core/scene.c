@@ -157,7 +157,7 @@ static size_t put_metres(char *at, int64_t tenths_mm)
 	if (fraction == 0)
 		return n;
 	at[n++] = '.';
-	for (unsigned place = 1000; fraction > 0; place /= 10) {
+	for (unsigned place = 1000; fraction > 0 && place > 0; place /= 10) {
 		at[n++] = (char)('0' + fraction / place);
 		fraction %= place;
 	}

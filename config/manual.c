@@ -108,8 +108,8 @@ static bool is_repeated(const struct key *key, unsigned driver)
 
 static void put_device(FILE *out, unsigned driver, bool *described)
 {
-	static const char *const names[] = {"laser", "servo", "pose",  "front", "left",
-	                                    "right", "angle", "drive", "wheels"};
+	static const char *const names[] = {"laser", "servo", "pose",  "front",  "left",
+	                                    "right", "angle", "drive", "wheels", "log"};
 	int place = 0;
 	while (driver >> place > 1)
 		place++;

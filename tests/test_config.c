@@ -615,7 +615,7 @@ static void only_who_has_an_encoder_or_a_servo_tilts(void **state)
 {
 	(void)state;
 	assert_refused("devices: [{name: a, driver: tim, connect: usb, encoder: {scale: 1deg}}]",
-	               "f.yaml:1: devices[0]", "'encoder' is a key of lms1xx, lms5xx, not of tim");
+	               "f.yaml:1: devices[0]", "'encoder' is a key of lms1xx, lms5xx, carmen, not of tim");
 	assert_refused("devices: [{name: a, driver: lms1xx, connect: 10.0.0.1, tilt: a}]", "f.yaml:1: devices[0].tilt",
 	               "tilts nothing");
 	assert_refused("devices: [{name: a, driver: lms1xx, connect: 10.0.0.1, encoder: {zero: 1}}]",
@@ -830,7 +830,7 @@ static void the_manual_is_a_configuration_and_names_every_key(void **state)
 	struct config_error error;
 	if (config_read(text, len, "config/facetd.yaml", &c, &error))
 		fail_msg("%s", error.text);
-	assert_int_equal(c.devices, 9); /* one of each driver */
+	assert_int_equal(c.devices, 10); /* one of each driver */
 	assert_true(c.sweep.set);
 	for (const struct key *key = key_table; key->name; key++) {
 		snprintf(word, sizeof(word), "%s:", key->name);

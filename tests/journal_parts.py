@@ -3,7 +3,7 @@
 JSON lines. Segments are cut, swapped and repeated as networks do it, so that reading them back is no matter of course.
 
     journal_parts.py JOURNAL OUT LASER SERVO POSE     the places of the devices in the configuration; writes OUT.pcap, .log, .jsonl,
-    and OUT.ended, the list with an end: what waited in it is handed out
+    and OUT.ended, the list as these tell it
 """
 import json
 import struct
@@ -40,8 +40,10 @@ def main():
     client, sequence, packets, said = None, None, [], 0
     with open(path, "rb") as f:
         data = f.read()
-    log, poses = [], []
+    log, poses, merged = [], [], []
     for log_ns, t_ns, device, direction, payload in entries(data):
+        if device == laser:
+            merged.append((t_ns, 0, device, direction, payload))
         if device == laser and direction == 2:
             client = ((10, 0, 0, 1), 40000 + said)
             said += 1
@@ -62,18 +64,26 @@ def main():
             for at in range(0, len(payload), 24):
                 number, n, _, _, _ = struct.unpack_from("<IBBBB", payload, at)
                 stamp = struct.unpack_from("<q", payload, at + 16)[0]
+                merged.append((stamp, 1, device, 0, payload[at:at + 24]))
                 name = f"{number & 0x1fffffff:08X}" if number & 0x80000000 else f"{number:03X}"
                 log.append((stamp, f"({stamp // 10**9}.{stamp % 10**9:09d}) can0 {name}#{payload[at + 8:at + 8 + n].hex().upper()}"))
         elif device == pose and direction == 0:
             text = json.loads(payload)
             text.setdefault("t", t_ns / 1e9)
+            merged.append((int(text["t"] * 1e9), 2, device, 0, json.dumps(text).encode()))
             poses.append(json.dumps(text))
     with open(out + ".pcap", "wb") as f:
         f.write(struct.pack("<IHHiIII", 0xa1b23c4d, 2, 4, 0, 0, 65535, 1))
         for t_ns, data in packets:
             f.write(struct.pack("<IIII", t_ns // 10**9, t_ns % 10**9, len(data), len(data)) + data)
-    with open(path, "rb") as f, open(out + ".ended", "wb") as g:  # the same list, and five quiet seconds
-        g.write(f.read() + struct.pack("<Bq", 3, log_ns + 5 * 10**9))
+    # The same records in the order of these files, and five quiet seconds: what waits is handed out.
+    merged.sort(key=lambda r: (r[0], r[1]))
+    with open(path, "rb") as f, open(out + ".ended", "wb") as g:
+        head = f.read(13)
+        g.write(head + f.read(struct.unpack_from("<I", head, 9)[0]))
+        for t_ns, _, device, direction, payload in merged:
+            g.write(struct.pack("<BqqBBI", 2, t_ns, t_ns, device, direction, len(payload)) + payload)
+        g.write(struct.pack("<Bq", 3, merged[-1][0] + 5 * 10**9))
     with open(out + ".log", "w", encoding="ascii") as f:
         f.writelines(line + "\n" for _, line in sorted(log))
     with open(out + ".jsonl", "w", encoding="ascii") as f:

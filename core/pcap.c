@@ -393,7 +393,7 @@ int pcap_flow_put(struct pcap_flow *f, const struct pcap_segment *segment)
 	uint32_t sequence = segment->sequence + (segment->flags & PCAP_SYN ? 1 : 0);
 	size_t len = segment->len;
 	struct piece piece;
-	int at = f->pieces;
+	int at;
 
 	if (segment->flags & PCAP_SYN) { /* another connection, or the same word said twice */
 		if (f->begun && f->next != sequence)
@@ -412,7 +412,7 @@ int pcap_flow_put(struct pcap_flow *f, const struct pcap_segment *segment)
 	if (!piece.data)
 		return -ENOMEM;
 	memcpy(piece.data, segment->data, len);
-	while (at > 0 && is_before(sequence, f->piece[at - 1].sequence))
+	for (at = f->pieces; at > 0 && is_before(sequence, f->piece[at - 1].sequence);)
 		at--;
 	memmove(&f->piece[at + 1], &f->piece[at], (size_t)(f->pieces - at) * sizeof piece);
 	f->piece[at] = piece;

@@ -1,5 +1,7 @@
-/* Laws L4, L6 end to end: one client that reads everything, one that joins in the middle and two that stop reading for a
- * while (unix socket; TCP with a small receive buffer) hold whole meshes at every COMMIT and end with the same bytes.
+/* Laws L4, L6 end to end: one client that reads everything, one that joins in the middle, two that stop reading for a
+ * while (unix socket; TCP with a small receive buffer), and eight that stall, leave, come back and change their wishes
+ * (coded, compressed, limited, a box, a radius) at random hold whole meshes at every COMMIT and end with the same bytes, or
+ * their part of them.
  *
  *   clients UNIX_PATH TCP_PORT OUT_DIR JOIN_S STALL_FROM_S STALL_S
  *
@@ -17,9 +19,13 @@
 #include <unistd.h>
 
 #include "core/native.h"
+#include "daemon/interest.h"
 
-#define CLIENTS 4
-#define QUIET_S 4   /* no new step for so long, and everyone at the same one: the end */
+#define FIXED   4 /* clients with a part to play; the others act at random */
+#define CLIENTS 12
+/* No new step for so long, and everyone at the same one: the end. The look-ahead is folded a second after the last row, and
+ * the simulator takes everything down after two. */
+#define QUIET_S 0.7
 #define LIMIT_S 150 /* then it has failed */
 #define MISSED \
 	(20 * 16384) /* bytes that the stall lasts for at least: twenty send buffers of the daemon's configuration */
@@ -33,7 +39,18 @@ struct client {
 	uint8_t *buf;
 	size_t len;
 	unsigned commits;
+	struct native_want want;
+	double act_s; /* when a random one does something next */
+	bool pauses;
 };
+
+/* What some client held of a key at a version: the bytes of a version never differ. */
+struct known {
+	struct patch_key key;
+	uint64_t version, hash;
+	bool used;
+};
+#define KNOWN_MAX (1u << 18)
 
 struct test {
 	const char *unix_path, *dir;
@@ -45,6 +62,10 @@ struct test {
 	char (*hash)[65]; /* [STEPS_MAX] of the mesh of each step, as first seen */
 	uint64_t newest;
 	double newest_at_s;
+	struct known *known; /* [KNOWN_MAX] by key and version */
+	size_t knowns;
+	uint64_t random;
+	unsigned joins, wishes, pauses, parts;
 };
 
 static double now_s(void)
@@ -81,16 +102,62 @@ static int connect_tcp(int port)
 	return fd;
 }
 
-static void join(struct test *t, struct client *c)
+static uint32_t pick(struct test *t, uint32_t n) /* 0 .. n - 1; xorshift */
+{
+	t->random ^= t->random << 13;
+	t->random ^= t->random >> 7;
+	t->random ^= t->random << 17;
+	return (uint32_t)(t->random >> 33) % n;
+}
+
+static void wish(struct test *t, struct client *c)
+{
+	float x = (float)pick(t, 100) / 10 - 5, y = (float)pick(t, 100) / 10 - 5;
+	uint32_t kind = pick(t, 3);
+
+	c->want =
+	    (struct native_want){.flags = (uint8_t)(pick(t, 2) * NATIVE_WANT_CODED | pick(t, 2) * NATIVE_WANT_ZSTD),
+	                         .bytes_per_s = pick(t, 3) == 0 ? 300000 + pick(t, 2000000) : 0};
+	if (kind == 1) {
+		c->want.flags |= NATIVE_WANT_BOX;
+		memcpy(c->want.region, (float[6]){x - 3, y - 3, -1, x + 3, y + 3, 1.5f}, sizeof c->want.region);
+	} else if (kind == 2) {
+		c->want.flags |= NATIVE_WANT_RADIUS;
+		c->want.region[0] = 1 + (float)pick(t, 50) / 10;
+	}
+	t->wishes++;
+}
+
+static void say_want(struct client *c)
 {
 	struct buffer b = {0};
-	c->fd = c->tcp ? connect_tcp(t->port) : connect_unix(t->unix_path);
-	c->mirror = native_mirror_create();
-	c->buf = malloc(NATIVE_TO_CLIENT_MAX + NATIVE_HEAD);
-	native_put_want(&b, &(struct native_want){0});
+	native_put_want(&b, &c->want);
 	if (write(c->fd, b.data, b.len) != (ssize_t)b.len)
 		fail(c->name, "cannot ask for the map");
 	buffer_finish(&b);
+}
+
+static void join(struct test *t, struct client *c)
+{
+	c->fd = c->tcp ? connect_tcp(t->port) : connect_unix(t->unix_path);
+	c->mirror = native_mirror_create();
+	c->len = 0;
+	if (!c->buf)
+		c->buf = malloc(NATIVE_TO_CLIENT_MAX + NATIVE_HEAD);
+	say_want(c);
+	t->joins++;
+}
+
+static void leave(struct client *c)
+{
+	close(c->fd);
+	native_mirror_destroy(c->mirror);
+	c->mirror = NULL;
+}
+
+static bool wants_part(const struct client *c)
+{
+	return c->want.flags & (NATIVE_WANT_BOX | NATIVE_WANT_RADIUS);
 }
 
 static void dump(struct test *t, struct client *c, uint64_t step)
@@ -109,6 +176,44 @@ static void dump(struct test *t, struct client *c, uint64_t step)
 	model_finish(&model);
 }
 
+static uint64_t hash_patch(const struct patch *patch)
+{
+	struct buffer b = {0};
+	uint64_t h = 14695981039346656037ull;
+	native_put_patch(&b, patch);
+	for (size_t i = 0; i < b.len; i++)
+		h = (h ^ b.data[i]) * 1099511628211ull;
+	buffer_finish(&b);
+	return h;
+}
+
+/* The place of what is known of a key at a version; unused where nobody held it. */
+static struct known *find_known(struct test *t, struct patch_key key, uint64_t version)
+{
+	uint64_t at = (uint32_t)key.x * 73856093ull ^ (uint32_t)key.y * 19349663ull ^ (uint32_t)key.z * 83492791ull;
+	at = (at ^ version * 2654435761ull) % KNOWN_MAX;
+	while (t->known[at].used && (t->known[at].version != version || patch_key_compare(t->known[at].key, key) != 0))
+		at = (at + 1) % KNOWN_MAX;
+	return &t->known[at];
+}
+
+/* Every patch is what everybody else had of that version. */
+static void compare_patches(struct test *t, struct client *c)
+{
+	struct patch **patch;
+	size_t n = patch_store_living(native_mirror_patches(c->mirror), &patch);
+	for (size_t i = 0; i < n; i++) {
+		struct known *known = find_known(t, patch[i]->key, patch[i]->version);
+		uint64_t hash = hash_patch(patch[i]);
+		if (known->used && known->hash != hash)
+			fail(c->name, "holds other bytes of a version than another client");
+		if (!known->used && t->knowns++ == KNOWN_MAX / 2)
+			fail(c->name, "more versions than this test is for");
+		*known = (struct known){patch[i]->key, patch[i]->version, hash, true};
+	}
+	free(patch);
+}
+
 static void committed(struct test *t, struct client *c)
 {
 	char hash[65];
@@ -116,6 +221,17 @@ static void committed(struct test *t, struct client *c)
 	if (step >= STEPS_MAX)
 		fail(c->name, "more steps than this test is for");
 	c->commits++;
+	if (c - t->client >= FIXED || c->commits % 8 == 0)
+		compare_patches(t, c);
+	if (step > t->newest) {
+		t->newest = step;
+		t->newest_at_s = now_s();
+	}
+	if (c - t->client >= FIXED) {
+		t->parts++;
+		if (wants_part(c))
+			return;
+	}
 	patch_store_hash(native_mirror_patches(c->mirror), hash);
 	if (!t->hash[step][0]) {
 		memcpy(t->hash[step], hash, sizeof hash);
@@ -123,10 +239,38 @@ static void committed(struct test *t, struct client *c)
 	} else if (strcmp(hash, t->hash[step]) != 0) {
 		fail(c->name, "holds another mesh of a step than the client that saw it first");
 	}
-	if (step > t->newest) {
-		t->newest = step;
-		t->newest_at_s = now_s();
+}
+
+/* What `c` holds is what of the whole map lies in the region. */
+static bool is_part(const struct test *t, const struct client *c, const struct interest *region)
+{
+	struct patch **all;
+	size_t n = patch_store_living(native_mirror_patches(t->client[0].mirror), &all), part = 0;
+	bool same = true;
+	for (size_t i = 0; i < n && same; i++) {
+		const struct patch *held = patch_store_get(native_mirror_patches(c->mirror), all[i]->key);
+		bool wanted = interest_has(region, all[i]->key);
+		part += wanted;
+		same = wanted ? held && held->nt > 0 && held->version == all[i]->version && patch_equal(held, all[i])
+		              : !held || held->nt == 0;
 	}
+	free(all);
+	return same && patch_store_count(native_mirror_patches(c->mirror)) == part;
+}
+
+/* The robot stands, near the origin: the radius is about one of the patches there. */
+static bool holds_its_part(const struct test *t, const struct client *c)
+{
+	double cell_m = native_mirror_hello(c->mirror)->cell_m;
+	struct interest region;
+	for (int i = 0; i < 7 * 7 * 7; i++) {
+		struct patch_key robot = {i % 7 - 3, i / 7 % 7 - 3, i / 49 - 3};
+		if (interest_of(&c->want, cell_m, robot, &region) == 0 && is_part(t, c, &region))
+			return true;
+		if (!(c->want.flags & NATIVE_WANT_RADIUS))
+			return false;
+	}
+	return false;
 }
 
 static void feed(struct test *t, struct client *c)
@@ -140,11 +284,18 @@ static void feed(struct test *t, struct client *c)
 			fail(c->name, "the stream is not framed");
 		if (n == 0)
 			break;
-		int r = native_decode(c->buf + at, (size_t)n, &message, error);
+		struct buffer plain = {0};
+		int r = 0;
+		if (native_is_packed(c->buf + at))
+			r = native_unpack(c->buf + at, (size_t)n, NATIVE_TO_CLIENT_MAX, &plain, error);
+		if (r == 0)
+			r = plain.len ? native_decode(plain.data, plain.len, &message, error)
+			              : native_decode(c->buf + at, (size_t)n, &message, error);
 		if (r == 0)
 			r = native_mirror_apply(c->mirror, &message, error);
 		if (r < 0)
 			fail(c->name, error);
+		buffer_finish(&plain);
 		if (r == 1)
 			committed(t, c);
 		at += (size_t)n;
@@ -156,6 +307,10 @@ static void feed(struct test *t, struct client *c)
 static void receive(struct test *t, struct client *c)
 {
 	ssize_t n = read(c->fd, c->buf + c->len, NATIVE_TO_CLIENT_MAX + NATIVE_HEAD - c->len);
+	if (n <= 0 && c - t->client >= FIXED) {
+		leave(c); /* too slow: it was told, and joins again */
+		return;
+	}
 	if (n <= 0)
 		fail(c->name, n ? strerror(errno) : "closed by the server");
 	c->len += (size_t)n;
@@ -200,12 +355,38 @@ static bool stalling(struct test *t, double s)
 	return false;
 }
 
+/* A random client does something, until the stall is over: then all read on. */
+static void act(struct test *t, struct client *c, double s)
+{
+	if (t->over)
+		c->pauses = false;
+	if (t->over && c->mirror)
+		return;
+	if (s < c->act_s && c->mirror)
+		return;
+	c->act_s = s + 0.1 + pick(t, 40) / 10.0;
+	c->pauses = !t->over && pick(t, 3) == 0;
+	t->pauses += c->pauses;
+	if (c->mirror && pick(t, 5) == 0)
+		leave(c);
+	if (!c->mirror || pick(t, 4) == 0) {
+		wish(t, c);
+		if (c->mirror)
+			say_want(c);
+	}
+	if (!c->mirror)
+		join(t, c);
+}
+
 static bool ended(const struct test *t)
 {
 	if (!t->over || now_s() - t->newest_at_s < QUIET_S)
 		return false;
 	for (int i = 0; i < CLIENTS; i++)
 		if (!t->client[i].mirror || native_mirror_step(t->client[i].mirror) != t->newest)
+			return false;
+	for (int i = FIXED; i < CLIENTS; i++)
+		if (!holds_its_part(t, &t->client[i]))
 			return false;
 	return true;
 }
@@ -219,9 +400,12 @@ static void run(struct test *t)
 		struct pollfd p[CLIENTS];
 		for (int i = 0; i < CLIENTS; i++) {
 			struct client *c = &t->client[i];
-			if (!c->mirror && (!c->late || s >= t->join_s))
+			if (i >= FIXED)
+				act(t, c, s);
+			else if (!c->mirror && (!c->late || s >= t->join_s))
 				join(t, c);
-			p[i] = (struct pollfd){c->mirror && !(stall && c->stalls) ? c->fd : -1, POLLIN, 0};
+			p[i] =
+			    (struct pollfd){c->mirror && !c->pauses && !(stall && c->stalls) ? c->fd : -1, POLLIN, 0};
 		}
 		if (ended(t))
 			return;
@@ -251,8 +435,16 @@ int main(int argc, char **argv)
 	                            {.name = "stalls, tcp", .tcp = true, .stalls = true},
 	                            {.name = "joins late", .late = true}}};
 	t.hash = calloc(STEPS_MAX, sizeof *t.hash);
+	t.known = calloc(KNOWN_MAX, sizeof *t.known);
+	t.random = 88172645463325252ull;
+	for (int i = FIXED; i < CLIENTS; i++)
+		t.client[i] = (struct client){.name = "acts at random", .tcp = i % 2};
+	setvbuf(stdout, NULL, _IOLBF, 0);
 	run(&t);
-	for (int i = 0; i < CLIENTS; i++) {
+	printf(
+	    "note: 8 clients at random joined %u times, wished %u times, paused %u times, %u of their commits judged\n",
+	    t.joins - FIXED, t.wishes, t.pauses, t.parts);
+	for (int i = 0; i < FIXED; i++) {
 		char hash[65];
 		patch_store_hash(native_mirror_patches(t.client[i].mirror), hash);
 		printf("%s: %u commits, step %llu, %s\n", t.client[i].name, t.client[i].commits,

@@ -306,8 +306,9 @@ const claims = {
       return replay.state === 'paused' && Math.abs(replay.position - replay.begin - 0.2 * (replay.end - replay.begin)) < 0.5;
     });
     await page.until('the page has that map', 40, `viewer.counts().step === ${(await status()).step} && viewer.counts().drawn === ${(await status()).map_size.triangles}`);
+    await page.until('the page says that it is paused', 20, `viewer.status().replay.state === 'paused'`);
     await page.ask(`document.getElementById('play').click()`);
-    await until('it plays to the end', 60, async () => (await status()).replay.state === 'ended');
+    await until('it plays to the end', 120, async () => (await status()).replay.state === 'ended');
     await holds(page, 'the page has the whole map', await status());
     await page.close();
     await end(bed.daemon);

@@ -34,7 +34,7 @@ export class Transport {
   }
 
   get playing() {
-    return this.replay?.state === 'playing' || this.replay?.state === 'seeking';
+    return this.was === 'playing';
   }
 
   get wanted() {
@@ -45,6 +45,7 @@ export class Transport {
   show(replay, may) {
     this.replay = replay ?? null;
     this.at = performance.now();
+    if (replay && replay.state !== 'seeking') this.was = replay.state; // a seek ends in the state it began in
     $('transport').hidden = !replay;
     if (!replay) return;
     $('length-of').textContent = clock(replay.end - replay.begin);

@@ -655,7 +655,7 @@ static void allow_gap(const struct pose_track *k, int64_t t_ns, struct judgement
 {
 	if (k->gap.ns == 0 || t_ns <= k->gap.begin_ns)
 		return;
-	j->slack_m += k->gap.m + fmin(k->gap.rad, 2) * k->gap.after_m;
+	j->slack_m += k->gap.m + (k->gap.rad < 2 ? k->gap.rad : 2) * k->gap.after_m;
 	j->slack_rad += k->gap.rad;
 }
 

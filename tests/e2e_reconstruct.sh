@@ -146,7 +146,7 @@ mkfifo pipe.xyz
     refused 2 'no input' reconstruct -o bad.ply
     refused 2 'no output' reconstruct scan000.3d
 }
-for command in record replay info repair calibrate bench decimate; do
+for command in calibrate bench decimate; do
     refused 2 "$command: this command comes in a later version" $command x
 done
 refused 2 'there is no such command' juggle

@@ -80,7 +80,7 @@ if make -s --no-print-directory install config="${config:-release}" DESTDIR="$sc
         lib/udev/rules.d/70-facetd.rules lib/sysusers.d/facetd.conf share/doc/facetd/dynamic-user.conf share/doc/facetd/facetd.yaml; do
         [ -s "$scratch/image/usr/$file" ] || fail "make install leaves out $file"
     done
-    grep -rl '@[A-Z]*@' "$scratch/image/usr/lib" && fail "a placeholder is left in what is installed"
+    grep -rIl '@[A-Z]*@' "$scratch/image/usr/lib" && fail "a placeholder is left in what is installed"
 else
     cat "$scratch/install"
     fail "make install"

@@ -173,7 +173,7 @@ def read_map():
     for kind, data in frames(stream):
         if kind == 1:
             major, minor, map_id, generation, cell, hello_step, t = struct.unpack("<HH16sIdQq", data)
-            assert (major, minor) == (1, 0) and cell == 0.05 and generation == 1 and abs(t / 1e9 - time.time()) < 60
+            assert major == 1 and cell == 0.05 and generation == 1 and abs(t / 1e9 - time.time()) < 60
         elif kind == 3:
             step, count, removals, reset = struct.unpack("<QIIB", data)
             assert reset == 1 and removals == 0

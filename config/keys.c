@@ -228,8 +228,8 @@ const struct key key_table[] = {
 };
 /* clang-format on */
 
-static const char *const driver_names[] = {"lms2xx", "modbus", "pose",    "tim",      "lms1xx",
-                                           "lms5xx", "can",    "canopen", "odometry", "carmen", NULL};
+static const char *const driver_names[] = {"lms2xx", "modbus",  "pose",     "tim",    "lms1xx", "lms5xx",
+                                           "can",    "canopen", "odometry", "carmen", NULL};
 
 unsigned keys_driver(const char *name)
 {

@@ -38,8 +38,8 @@ struct publisher_encoder {
 struct publisher_params {
 	uint8_t map_id[16];
 	double cell_m;
-	size_t pinned_max;                                 /* 0: PUBLISHER_PINNED_MAX */
-	size_t forms_bytes;                                /* 0: PUBLISHER_FORMS_BYTES */
+	size_t pinned_max;  /* 0: PUBLISHER_PINNED_MAX */
+	size_t forms_bytes; /* 0: PUBLISHER_FORMS_BYTES */
 	size_t window; /* of a batch, in patches: at most as many as 0 means, which is right for everything but tests */
 	struct publisher_encoder encoder[PUBLISHER_FORMS]; /* of the scenes; the first three need none */
 };

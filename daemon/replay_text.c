@@ -7,7 +7,7 @@
 #include <stdlib.h>
 #include <string.h>
 
-#include "core/carmen.h"
+#include "core/carmen_lines.h"
 #include "core/trig.h"
 #include "daemon/replay_source.h"
 #include "drivers/candump.h"

@@ -9,7 +9,7 @@
 #include <stdlib.h>
 #include <string.h>
 
-#include "core/carmen.h"
+#include "core/carmen_lines.h"
 #include "core/trig.h"
 #include "drivers/driver.h"
 

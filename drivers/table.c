@@ -4,8 +4,8 @@
 #include <string.h>
 
 const struct driver *const driver_table[] = {
-    &driver_lms2xx, &driver_modbus, &driver_pose,    &driver_tim,      &driver_lms1xx,
-    &driver_lms5xx, &driver_can,    &driver_canopen, &driver_odometry, &driver_carmen, NULL,
+    &driver_lms2xx, &driver_modbus,  &driver_pose,     &driver_tim,    &driver_lms1xx, &driver_lms5xx,
+    &driver_can,    &driver_canopen, &driver_odometry, &driver_carmen, NULL,
 };
 
 const struct driver *driver_find(const char *name)

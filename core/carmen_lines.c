@@ -1,6 +1,6 @@
 /* Counts are judged before anything is read by them. Where the old form of ROBOTLASER leaves the remissions out, the number of
  * numbers up to the host's name tells. */
-#include "core/carmen.h"
+#include "core/carmen_lines.h"
 
 #include <math.h>
 #include <string.h>

@@ -9,8 +9,8 @@
  *
  * Metres, radians; beams from right to left, 0 straight ahead. Old logs have SICK's error codes as ranges (81.83 .. 81.91).
  * Some were printed with 6 digits, so that a time of the year 2005 is off by minutes (1.13486e+09): `coarse`. Pure. */
-#ifndef FACET_CORE_CARMEN_H
-#define FACET_CORE_CARMEN_H
+#ifndef FACET_CORE_CARMEN_LINES_H
+#define FACET_CORE_CARMEN_LINES_H
 
 #include <stdbool.h>
 #include <stddef.h>

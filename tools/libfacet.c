@@ -394,7 +394,8 @@ static int take_frame(struct facet *facet, struct facet_event *ret)
 static int take_line(struct facet *facet, struct facet_event *ret)
 {
 	const size_t len = facet->end - facet->begin;
-	const char *line = (const char *)facet->data + facet->begin, *newline = len ? memchr(line, '\n', len) : NULL;
+	const char *line = len ? (const char *)facet->data + facet->begin : NULL;
+	const char *newline = len ? memchr(line, '\n', len) : NULL;
 	if (!newline && len > LIBFACET_LINE_MAX)
 		return fail(facet, -EPROTO, "%s: a line without an end", facet->where);
 	if (!newline)

@@ -261,7 +261,8 @@ bool recorder_take(struct recorder *r, size_t max, struct buffer *ret, char reas
 	pthread_mutex_lock(&r->lock);
 	left = r->stream.len - r->stream_at;
 	left = left < max ? left : max;
-	buffer_append(ret, r->stream.data + r->stream_at, left);
+	if (left > 0)
+		buffer_append(ret, r->stream.data + r->stream_at, left);
 	if (!ret->error)
 		r->stream_at += left;
 	if (r->stream_at == r->stream.len)

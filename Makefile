@@ -63,7 +63,7 @@ TOOLS := $(filter-out tools/facet.c,$(wildcard tools/*.c))
 TESTS := $(patsubst tests/%.c,%,$(wildcard tests/test_*.c))
 PROGRAMS := clients steps usb_bed gadget canopen_node angles
 RIGGED := $(filter test_rig test_cola_sessions test_matrix_% test_chaos test_servos test_snapshot,$(TESTS)) # they stand on tests/rig*.c
-THREADED := test_worker test_archive test_server test_replay test_modbus_bus test_sim_servo test_sim_drive test_client
+THREADED := test_worker test_archive test_server test_replay test_modbus_bus test_sim_servo test_sim_drive test_client test_recorder
 FUZZ := $(patsubst tests/%.c,%,$(wildcard tests/fuzz_*.c))
 LIBRARIES := $(B)/libtools.a $(B)/libdaemon.a $(B)/libdrivers.a $(B)/libconfig.a $(B)/libcore.a
 

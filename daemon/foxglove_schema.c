@@ -82,10 +82,6 @@ struct shape {
 	{                               \
 		(name), (kind), 0, true \
 	}
-/* Written out: cppcheck takes a list in a macro for one argument. */
-#define X      PLAIN("x", DOUBLE)
-#define Y      PLAIN("y", DOUBLE)
-#define Z      PLAIN("z", DOUBLE)
 #define TIME   ONE("timestamp", M_TIMESTAMP)
 #define FRAME  PLAIN("frame_id", STRING)
 #define POSE   ONE("pose", M_POSE)
@@ -95,9 +91,13 @@ struct shape {
 static const struct shape shapes[MESSAGES] = {
     [M_TIMESTAMP] = {GOOGLE, "Timestamp", {PLAIN("seconds", INT64), PLAIN("nanos", INT32)}, NULL, {NULL}},
     [M_DURATION] = {GOOGLE, "Duration", {PLAIN("seconds", INT64), PLAIN("nanos", INT32)}, NULL, {NULL}},
-    [M_VECTOR3] = {"foxglove", "Vector3", {X, Y, Z}, NULL, {NULL}},
-    [M_QUATERNION] = {"foxglove", "Quaternion", {X, Y, Z, PLAIN("w", DOUBLE)}, NULL, {NULL}},
-    [M_POINT3] = {"foxglove", "Point3", {X, Y, Z}, NULL, {NULL}},
+    [M_VECTOR3] = {"foxglove", "Vector3", {PLAIN("x", DOUBLE), PLAIN("y", DOUBLE), PLAIN("z", DOUBLE)}, NULL, {NULL}},
+    [M_QUATERNION] = {"foxglove",
+                      "Quaternion",
+                      {PLAIN("x", DOUBLE), PLAIN("y", DOUBLE), PLAIN("z", DOUBLE), PLAIN("w", DOUBLE)},
+                      NULL,
+                      {NULL}},
+    [M_POINT3] = {"foxglove", "Point3", {PLAIN("x", DOUBLE), PLAIN("y", DOUBLE), PLAIN("z", DOUBLE)}, NULL, {NULL}},
     [M_POSE] = {"foxglove", "Pose", {ONE("position", M_VECTOR3), ONE("orientation", M_QUATERNION)}, NULL, {NULL}},
     [M_COLOR] = {"foxglove",
                  "Color",

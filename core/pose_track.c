@@ -12,8 +12,9 @@
  *
  * Jumps. Where the wheels lead is known with odometry. Without it (or while it is silent) a robot goes on as it did or
  * stands, and it may have changed its speed by SLACK since the last pose: the longer nothing was heard, the less can be
- * called a jump; what a silence hid holds for the poses after it until one of them has said where the robot is. History is moved along with a jump, so that the twist goes on. The way back is recognised by the frame
- * before: a single outlier is one jump and one back, and ignoring both leaves no trace. */
+ * called a jump; what a silence hid holds for the poses after it until one of them has said where the robot is. History is
+ * moved along with a jump, so that the twist goes on. The way back is recognised by the frame before: a single outlier is
+ * one jump and one back, and ignoring both leaves no trace. */
 #include "core/pose_track.h"
 
 #include <stdlib.h>

@@ -177,6 +177,8 @@ refused() { # WORDS ARGUMENT...
 echo hello >"$scratch/hello"
 refused 'is no recording' "$scratch/hello"
 refused 'give it with --config' "$scratch/part.log"
+head -c 1100000 /dev/zero | tr '\0' '#' >"$scratch/large.yaml"
+refused 'more than 1 MB' --config "$scratch/large.yaml" "$scratch/part.log"
 refused 'cannot be replayed together' --config "$scratch/live.yaml" "$scratch/part.log" "$scratch/journal"
 sed 's/connect: unix:[^,}]*/connect: can7/' "$scratch/live.yaml" | sed 's/connect: "unix:[^"]*"/connect: can7/' >"$scratch/other.yaml"
 refused 'no device of the configuration is on can0' --config "$scratch/other.yaml" "$scratch/part.log"

@@ -45,13 +45,27 @@ static const struct argp_option table[] = {
     {0},
 };
 
+static void say(const char *format, va_list args)
+{
+	fputs("facet: ", stderr);
+	vfprintf(stderr, format, args);
+	fputc('\n', stderr);
+}
+
+int options_complain(const char *format, ...)
+{
+	va_list args;
+	va_start(args, format);
+	say(format, args);
+	va_end(args);
+	return 1;
+}
+
 void options_refuse(const char *format, ...)
 {
 	va_list args;
 	va_start(args, format);
-	fputs("facet: ", stderr);
-	vfprintf(stderr, format, args);
-	fputc('\n', stderr);
+	say(format, args);
 	va_end(args);
 	exit(2);
 }

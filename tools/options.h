@@ -31,6 +31,9 @@ void options_default(struct options *);
 void options_check(const struct options *, const char *command);
 /* "--NAME WORD: give a number from ..." and out. */
 double options_number(const char *name, const char *word, double min, double max);
+/* A sentence about bad input; 1, the status that goes with it. */
+int __attribute__((format(printf, 1, 2))) options_complain(const char *format, ...);
+/* A sentence about bad usage, and out with status 2. */
 void __attribute__((noreturn, format(printf, 1, 2))) options_refuse(const char *format, ...);
 
 /* Reads the command line. Bad usage ends the program with a sentence and status 2, `--help` with status 0 (argp's way). */

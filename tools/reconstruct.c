@@ -9,7 +9,6 @@
 #include <fcntl.h>
 #include <limits.h>
 #include <pthread.h>
-#include <stdarg.h>
 #include <stdatomic.h>
 #include <stdio.h>
 #include <stdlib.h>
@@ -47,21 +46,9 @@ struct bytes {
 	size_t len;
 };
 
-static int complain(const char *format, ...) __attribute__((format(printf, 1, 2)));
-static int complain(const char *format, ...)
-{
-	va_list args;
-	va_start(args, format);
-	fputs("facet: ", stderr);
-	vfprintf(stderr, format, args);
-	fputc('\n', stderr);
-	va_end(args);
-	return 1;
-}
-
 static int out_of_memory(const char *path)
 {
-	return complain("%s: not enough memory; use a larger --cell or fewer inputs", path);
+	return options_complain("%s: not enough memory; use a larger --cell or fewer inputs", path);
 }
 
 static int complain_parse(const char *path, int r, const struct parse_error *error)
@@ -69,8 +56,8 @@ static int complain_parse(const char *path, int r, const struct parse_error *err
 	if (r == -ENOMEM)
 		return out_of_memory(path);
 	if (error->line)
-		return complain("%s:%u: %s", path, error->line, error->text);
-	return complain("%s: %s", path, error->text);
+		return options_complain("%s:%u: %s", path, error->line, error->text);
+	return options_complain("%s: %s", path, error->text);
 }
 
 /* What this process has used since the last call goes to `stage`. */
@@ -121,12 +108,12 @@ static int read_file(const char *path, struct bytes *ret)
 	return r;
 }
 
-static int read_or_complain(const char *path, struct bytes *ret)
+static int read_or_options_complain(const char *path, struct bytes *ret)
 {
 	int r = read_file(path, ret);
 	if (r == -EINVAL)
-		return complain("%s: is no ordinary file; save it to one first", path);
-	return r < 0 ? complain("%s: cannot be read: %s", path, strerror(-r)) : 0;
+		return options_complain("%s: is no ordinary file; save it to one first", path);
+	return r < 0 ? options_complain("%s: cannot be read: %s", path, strerror(-r)) : 0;
 }
 
 /* Poses */
@@ -134,7 +121,7 @@ static int read_or_complain(const char *path, struct bytes *ret)
 static int read_pose(const char *path, struct transform *ret)
 {
 	struct bytes bytes;
-	if (read_or_complain(path, &bytes))
+	if (read_or_options_complain(path, &bytes))
 		return 1;
 	struct parse_error error;
 	int r = uos_read_pose((const char *)bytes.data, bytes.len, ret, &error);
@@ -152,19 +139,19 @@ static int parse_tum(struct run *run, const struct bytes *bytes)
 		for (int i = 1; good && i < 8; i++)
 			good = v[i] >= -1e6 && v[i] <= 1e6;
 		if (!good)
-			return complain("%s:%u: expected eight numbers: t x y z qx qy qz qw", run->options.pose_path,
-			                text.line);
+			return options_complain("%s:%u: expected eight numbers: t x y z qx qy qz qw",
+			                        run->options.pose_path, text.line);
 		double length2 = v[4] * v[4] + v[5] * v[5] + v[6] * v[6] + v[7] * v[7];
 		if (!(length2 > 0.98 && length2 < 1.02))
-			return complain("%s:%u: qx qy qz qw have the length %.3g, a rotation has 1",
-			                run->options.pose_path, text.line, sqrt(length2));
+			return options_complain("%s:%u: qx qy qz qw have the length %.3g, a rotation has 1",
+			                        run->options.pose_path, text.line, sqrt(length2));
 		struct quat q = quat_normalise((struct quat){v[7], v[4], v[5], v[6]});
 		run->pose[run->poses++] = transform_quat((struct vec3){v[1], v[2], v[3]}, q);
 		text_next_line(&text);
 	}
 	if (run->poses < run->options.inputs)
-		return complain("%s: has %d poses for %d inputs; give a line for each", run->options.pose_path,
-		                run->poses, run->options.inputs);
+		return options_complain("%s: has %d poses for %d inputs; give a line for each", run->options.pose_path,
+		                        run->poses, run->options.inputs);
 	return 0;
 }
 
@@ -179,7 +166,7 @@ static int read_poses(struct run *run)
 	if (o->pose != POSE_LIST)
 		return 0;
 	struct bytes bytes;
-	if (read_or_complain(o->pose_path, &bytes))
+	if (read_or_options_complain(o->pose_path, &bytes))
 		return 1;
 	int r = parse_tum(run, &bytes);
 	free(bytes.data);
@@ -192,11 +179,11 @@ static int pose_beside(const char *path, struct transform *ret)
 	char beside[PATH_MAX];
 	size_t stem = strlen(path) - strlen(".3d");
 	if (stem + sizeof ".pose" > sizeof beside)
-		return complain("%s: the name is too long", path);
+		return options_complain("%s: the name is too long", path);
 	memcpy(beside, path, stem);
 	strcpy(beside + stem, ".pose");
 	if (access(beside, F_OK) < 0)
-		return complain("%s: there is no %s beside it; give --pose FILE or --no-pose", path, beside);
+		return options_complain("%s: there is no %s beside it; give --pose FILE or --no-pose", path, beside);
 	return read_pose(beside, ret);
 }
 
@@ -351,11 +338,12 @@ static int check_inputs(const struct options *o)
 		if (format && format->add)
 			continue;
 		if (format)
-			complain("%s: %s files come in a later version; give .3d, .pcd, .ply, .xyz or .pts",
-			         o->input[i], format->ending);
+			options_complain("%s: %s files come in a later version; give .3d, .pcd, .ply, .xyz or .pts",
+			                 o->input[i], format->ending);
 		else
-			complain("%s: the ending names no format that is read; give .3d, .pcd, .ply, .xyz or .pts",
-			         o->input[i]);
+			options_complain(
+			    "%s: the ending names no format that is read; give .3d, .pcd, .ply, .xyz or .pts",
+			    o->input[i]);
 		return 2;
 	}
 	return 0;
@@ -377,7 +365,7 @@ static int add_input(struct run *run, const char *path)
 {
 	struct bytes bytes;
 	struct parse_error error = {0};
-	if (read_or_complain(path, &bytes))
+	if (read_or_options_complain(path, &bytes))
 		return 1;
 	int r = find_format(path)->add(run, &bytes, &error);
 	free(bytes.data);
@@ -508,14 +496,14 @@ static int write_mesh(struct run *run)
 	int r = output_mesh(run->options.output, &model, run->options.ascii, &error);
 	model_finish(&model);
 	lap(run, WRITE);
-	return r < 0 ? complain("%s", error.text) : 0;
+	return r < 0 ? options_complain("%s", error.text) : 0;
 }
 
 static int write_stats(struct run *run)
 {
 	struct output_error error;
 	int r = figures_write(&run->figures, run->options.stats, &error);
-	return r < 0 ? complain("%s", error.text) : 0;
+	return r < 0 ? options_complain("%s", error.text) : 0;
 }
 
 static void tell(const struct run *run)
@@ -544,7 +532,7 @@ static int check_outputs(const struct options *o)
 {
 	struct output_error error;
 	if (output_check(o->output, &error) < 0 || (o->stats && output_check(o->stats, &error) < 0))
-		return complain("%s", error.text);
+		return options_complain("%s", error.text);
 	return 0;
 }
 

@@ -6,7 +6,6 @@
  * daemon has them. A recording in which the map began anew gives the last map. */
 #include <argp.h>
 #include <errno.h>
-#include <stdarg.h>
 #include <stdatomic.h>
 #include <stdio.h>
 #include <stdlib.h>
@@ -20,6 +19,7 @@
 #include "daemon/wall_clock.h"
 #include "tools/commands.h"
 #include "tools/figures.h"
+#include "tools/mapped.h"
 #include "tools/options.h"
 
 #define CONFIG_BYTES_MAX (1u << 20)
@@ -49,19 +49,6 @@ struct run {
 	atomic_uint_fast64_t progress;
 	atomic_bool stop;
 };
-
-static int complain(const char *format, ...) __attribute__((format(printf, 1, 2)));
-static int complain(const char *format, ...)
-{
-	va_list args;
-
-	va_start(args, format);
-	fputs("facet: ", stderr);
-	vfprintf(stderr, format, args);
-	fputc('\n', stderr);
-	va_end(args);
-	return 1;
-}
 
 static void lap(struct run *run, enum stage stage)
 {
@@ -142,54 +129,36 @@ static void parse_options(int argc, char **argv, struct run *run)
 
 /* Configuration */
 
-static char *read_text(const char *path, size_t *ret_len)
-{
-	FILE *file = fopen(path, "re");
-	char *text = malloc(CONFIG_BYTES_MAX + 1);
-	size_t n = 0;
-
-	errno = file ? 0 : errno;
-	if (file && text)
-		n = fread(text, 1, CONFIG_BYTES_MAX, file);
-	if (!file || !text || ferror(file)) {
-		complain("%s: cannot be read (%s)", path, strerror(errno ? errno : EIO));
-		free(text);
-		text = NULL;
-	} else {
-		text[n] = 0;
-		*ret_len = n;
-	}
-	if (file)
-		fclose(file);
-	return text;
-}
-
 static int parse_config(struct run *run, const char *text, size_t len, const char *name)
 {
 	struct config_error error = {""};
 	int r = config_read(text, len, name, &run->config, &error);
 
 	if (r < 0)
-		return complain("%s", r == -ENOMEM ? "out of memory" : error.text);
+		return options_complain("%s", r == -ENOMEM ? "out of memory" : error.text);
 	return 0;
 }
 
 static int load_config(struct run *run)
 {
 	const char *attached;
-	char *text;
+	struct mapped file;
+	char error[400];
 	size_t len;
 	int r;
 
 	if (run->config_path) {
-		text = read_text(run->config_path, &len);
-		r = text ? parse_config(run, text, len, run->config_path) : 1;
-		free(text);
+		if (mapped_open(run->config_path, &file, error) < 0)
+			return options_complain("%s", error);
+		r = file.len > CONFIG_BYTES_MAX
+		        ? options_complain("%s: more than 1 MB; is it a configuration?", run->config_path)
+		        : parse_config(run, (const char *)file.data, file.len, run->config_path);
+		mapped_close(&file);
 		return r;
 	}
 	attached = replay_config(run->replay, &len);
 	if (!attached)
-		return complain(
+		return options_complain(
 		    "%s: says nothing of the configuration it was recorded with; give it with --config FILE",
 		    run->options.input[0]);
 	return parse_config(run, attached, len, "facetd.yaml of the recording");
@@ -469,18 +438,18 @@ static int write_mesh(struct run *run)
 	int r;
 
 	if (count_patches(run) < 0)
-		return complain("out of memory");
+		return options_complain("out of memory");
 	grid_stats(map_grid(run->map), &grid);
 	f->blocks = grid.blocks;
 	if (model_weld(run->store, map_params(run).cell_m, &model) < 0)
-		return complain("out of memory");
+		return options_complain("out of memory");
 	r = output_mesh(run->options.output, &model, run->options.ascii, &error);
 	model_finish(&model);
 	lap(run, WRITE);
 	patch_store_hash(run->store, f->hash);
 	if (r == 0 && run->options.stats)
 		r = figures_write(f, run->options.stats, &error);
-	return r < 0 ? complain("%s", error.text) : 0;
+	return r < 0 ? options_complain("%s", error.text) : 0;
 }
 
 static void tell(const struct run *run)
@@ -514,12 +483,12 @@ static int replay(struct run *run)
 		run->mesher = mesher_create();
 	run->pipeline = pipeline_create(&run->config, &sink);
 	if (begin_map(run) < 0 || !run->pipeline || !(run->crew || run->mesher))
-		return complain("out of memory");
+		return options_complain("out of memory");
 	r = replay_use(run->replay, &run->config, error);
 	if (r == 0)
 		r = play(run, error);
 	if (r < 0)
-		return complain("%s", *error ? error : "out of memory; use a larger --cell");
+		return options_complain("%s", *error ? error : "out of memory; use a larger --cell");
 	r = write_mesh(run);
 	if (r == 0)
 		tell(run);
@@ -531,7 +500,7 @@ static int check_outputs(const struct options *o)
 	struct output_error error;
 
 	if (output_check(o->output, &error) < 0 || (o->stats && output_check(o->stats, &error) < 0))
-		return complain("%s", error.text);
+		return options_complain("%s", error.text);
 	return 0;
 }
 
@@ -545,7 +514,7 @@ int replay_main(int argc, char **argv)
 	parse_options(argc, argv, &run);
 	r = check_outputs(&run.options);
 	if (r == 0 && replay_open((const char *const *)run.options.input, run.options.inputs, &run.replay, error) < 0)
-		r = complain("%s", error);
+		r = options_complain("%s", error);
 	if (r == 0)
 		r = load_config(&run);
 	if (r == 0)

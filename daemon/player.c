@@ -43,6 +43,20 @@ void player_destroy(struct player *p)
 	free(p);
 }
 
+/* Where it stands: between two events the recorded clock goes on, too, but never beyond what comes next. */
+static int64_t position_ns(const struct player *p, int64_t mono_ns)
+{
+	const int64_t next_ns = replay_next_ns(p->replay);
+	int64_t ran_ns;
+
+	if (p->state != PLAYER_PLAYING || p->speed == 0 || !p->anchored || next_ns == INT64_MAX)
+		return p->now_ns;
+	ran_ns = p->anchor_ns + (int64_t)((double)(mono_ns - p->anchor_mono_ns) * p->speed);
+	if (ran_ns > next_ns)
+		ran_ns = next_ns;
+	return ran_ns > p->now_ns ? ran_ns : p->now_ns;
+}
+
 static void anchor(struct player *p, int64_t mono_ns)
 {
 	p->anchored = true;
@@ -161,6 +175,7 @@ static bool seek(struct player *p, int64_t t_ns, int64_t mono_ns)
 void player_play(struct player *p, bool play, int64_t mono_ns)
 {
 	p->play = play;
+	p->now_ns = position_ns(p, mono_ns);
 	if (p->state == PLAYER_ENDED && play)
 		seek(p, p->begin_ns, mono_ns);
 	else if (p->state == PLAYER_PLAYING || p->state == PLAYER_PAUSED)
@@ -193,13 +208,7 @@ bool player_speed(struct player *p, double speed, int64_t mono_ns, char error[20
 		snprintf(error, 200, "the speed is from %g to %g, or \"max\"", PLAYER_SPEED_MIN, PLAYER_SPEED_MAX);
 		return false;
 	}
-	if (p->state == PLAYER_PLAYING && p->speed != 0 && p->anchored) {
-		const int64_t ran_ns = p->anchor_ns + (int64_t)((double)(mono_ns - p->anchor_mono_ns) * p->speed);
-		const int64_t next_ns = replay_next_ns(p->replay);
-
-		if (ran_ns > p->now_ns)
-			p->now_ns = ran_ns < next_ns ? ran_ns : next_ns == INT64_MAX ? p->now_ns : next_ns;
-	}
+	p->now_ns = position_ns(p, mono_ns);
 	p->speed = speed;
 	anchor(p, mono_ns);
 	tell_rush(p);
@@ -208,17 +217,7 @@ bool player_speed(struct player *p, double speed, int64_t mono_ns, char error[20
 
 void player_status(const struct player *p, int64_t mono_ns, struct player_status *ret)
 {
-	int64_t now_ns = p->now_ns;
-
-	/* Between two events the clock goes on, too. */
-	if (p->state == PLAYER_PLAYING && p->speed != 0 && p->anchored) {
-		const int64_t ran_ns = p->anchor_ns + (int64_t)((double)(mono_ns - p->anchor_mono_ns) * p->speed);
-		const int64_t next_ns = replay_next_ns(p->replay);
-
-		if (ran_ns > now_ns && next_ns != INT64_MAX)
-			now_ns = ran_ns < next_ns ? ran_ns : next_ns;
-	}
-	*ret = (struct player_status){p->state, p->begin_ns, p->end_ns, now_ns, p->speed, p->seeks};
+	*ret = (struct player_status){p->state, p->begin_ns, p->end_ns, position_ns(p, mono_ns), p->speed, p->seeks};
 }
 
 const char *player_state_name(enum player_state state)

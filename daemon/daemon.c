@@ -1094,6 +1094,7 @@ static bool begin_parts(struct daemon *d, const struct daemon_options *options)
 	                                       .reduce = config->map.reduce,
 	                                       .lookahead = config->map.lookahead,
 	                                       .memory = config->map.memory},
+	                               .rows_max = options->rows_max,
 	                               .patient = d->replay != NULL,
 	                               .ready = on_worker_ready,
 	                               .ctx = &d->results};

@@ -10,7 +10,8 @@ struct daemon_options {
 	const char *journal;     /* keep what the loop hands to the pipeline in this file; NULL: nowhere */
 	/* Play this instead of the devices, none of which is opened; borrowed, told to use the configuration. NULL: none. */
 	struct replay *replay;
-	double speed; /* of the replay; 0: max */
+	double speed;    /* of the replay; 0: max */
+	size_t rows_max; /* that may wait for the worker; 0: WORKER_ROWS_MAX */
 };
 
 /* Runs until SIGINT or SIGTERM (orderly, within 3 s). 0, or -errno with one sentence. */

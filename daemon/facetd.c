@@ -8,17 +8,19 @@
 #include "config/keys.h"
 #include "daemon/daemon.h"
 #include "daemon/player.h"
+#include "daemon/worker.h"
 
 #define CONFIG_BYTES_MAX (1u << 20)
 #define CONFIG_DEFAULT   "/etc/facetd/facetd.yaml"
 
-enum { OPTION_CHECK = 256, OPTION_JOURNAL, OPTION_REPLAY, OPTION_SPEED, OPTION_MANUAL };
+enum { OPTION_CHECK = 256, OPTION_JOURNAL, OPTION_QUEUE, OPTION_REPLAY, OPTION_SPEED, OPTION_MANUAL };
 
 struct arguments {
 	const char *config, *journal;
 	const char *replay[REPLAY_FILES_MAX];
 	int replays;
 	double speed;
+	int queue; /* 0: as many as can be */
 	bool check;
 };
 
@@ -28,6 +30,8 @@ static const struct argp_option options[] = {
     {"journal", OPTION_JOURNAL, "FILE", 0,
      "keep what the devices sent in FILE, after each ?RESET in FILE.2 and so on, for tests and the search for faults",
      0},
+    {"queue", OPTION_QUEUE, "ROWS", 0,
+     "let so few rows wait for the map, so that some are dropped, for tests and the search for faults", 0},
     {"manual", OPTION_MANUAL, NULL, 0, "print the manual of the configuration, itself a configuration with every key",
      0},
     {"replay", OPTION_REPLAY, "FILE...", 0,
@@ -65,6 +69,19 @@ static error_t read_speed(struct arguments *arguments, const char *value, const 
 	return 0;
 }
 
+static error_t read_queue(struct arguments *arguments, const char *value, const struct argp_state *state)
+{
+	char *end;
+	const long rows = strtol(value, &end, 10);
+
+	if (*end || end == value || rows < 1 || rows > WORKER_ROWS_MAX) {
+		argp_failure(state, 2, 0, "--queue %s: give a number of rows from 1 to %d", value, WORKER_ROWS_MAX);
+		return EINVAL;
+	}
+	arguments->queue = (int)rows;
+	return 0;
+}
+
 static error_t parse(int key, char *value, struct argp_state *state)
 {
 	struct arguments *arguments = state->input;
@@ -79,6 +96,8 @@ static error_t parse(int key, char *value, struct argp_state *state)
 	case OPTION_JOURNAL:
 		arguments->journal = value;
 		return 0;
+	case OPTION_QUEUE:
+		return read_queue(arguments, value, state);
 	case OPTION_MANUAL:
 		keys_write_manual(stdout);
 		exit(fflush(stdout) ? 1 : 0);
@@ -230,6 +249,7 @@ int main(int argc, char **argv)
 		return 0;
 	}
 	run.journal = arguments.journal;
+	run.rows_max = (size_t)arguments.queue;
 	run.config_text = text;
 	r = daemon_run(&config, &run, error);
 	free(text);

@@ -114,7 +114,7 @@ static void put_map(struct buffer *b, const struct control_status *s)
 	gauge(b, "resident_memory_bytes", "What the daemon takes of the machine.", (double)s->rss_bytes);
 	gauge(b, "queue_rows", "Rows that wait for the worker.", (double)s->worker.queued);
 	gauge(b, "queue_rows_peak", "The most that ever waited.", (double)s->worker.queued_peak);
-	gauge(b, "queue_rows_cap", "The most that may wait.", WORKER_ROWS_MAX);
+	gauge(b, "queue_rows_cap", "The most that may wait.", (double)s->worker.rows_max);
 	family(b, "latency_seconds", "summary", "From a row's last byte to its published mesh, over the newest rows.");
 	if (s->latencies > 0) {
 		sample(b, "latency_seconds", "quantile", "0.5", s->latency_p50_ms / 1e3);

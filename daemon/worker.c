@@ -86,7 +86,7 @@ static bool next_item(struct worker *w, struct item *ret, bool *ret_more)
 		w->status.rows++;
 	}
 	*ret_more = w->items > 0;
-	room = w->params.patient && ret->kind == ITEM_ROW && w->status.queued == WORKER_ROWS_MAX / 2;
+	room = w->params.patient && ret->kind == ITEM_ROW && w->status.queued == w->status.rows_max / 2;
 	pthread_mutex_unlock(&w->lock);
 	if (room)
 		w->params.ready(w->params.ctx);
@@ -225,6 +225,7 @@ static struct worker *worker_allocate(const struct worker_params *params)
 	if (!w)
 		return NULL;
 	w->params = *params;
+	w->status.rows_max = params->rows_max ? params->rows_max : WORKER_ROWS_MAX;
 	w->newest = &w->oldest;
 	w->crew = crew_create(params->threads);
 	w->result = calloc(1, sizeof(*w->result));
@@ -264,7 +265,7 @@ struct worker *worker_create(const struct worker_params *params)
 {
 	struct worker *w;
 
-	assert(params->ready);
+	assert(params->ready && params->rows_max <= WORKER_ROWS_MAX);
 	w = worker_allocate(params);
 	if (!w)
 		return NULL;
@@ -321,7 +322,7 @@ bool worker_row(struct worker *w, struct row *row, int64_t arrival_ns)
 	bool taken;
 
 	pthread_mutex_lock(&w->lock);
-	taken = (w->params.patient || w->status.queued < WORKER_ROWS_MAX) &&
+	taken = (w->params.patient || w->status.queued < w->status.rows_max) &&
 	        push(w, (struct item){ITEM_ROW, row, arrival_ns});
 	if (taken) {
 		w->status.queued++;
@@ -339,7 +340,7 @@ bool worker_room(struct worker *w)
 	bool room;
 
 	pthread_mutex_lock(&w->lock);
-	room = w->status.queued < WORKER_ROWS_MAX;
+	room = w->status.queued < w->status.rows_max;
 	pthread_mutex_unlock(&w->lock);
 	return room;
 }

@@ -14,6 +14,7 @@
 struct worker_params {
 	bool patient; /* of a replay: no row is refused; worker_room says when to hand over none */
 	struct map_params map;
+	size_t rows_max;          /* that may wait, 1 .. WORKER_ROWS_MAX; 0: WORKER_ROWS_MAX */
 	int threads;              /* that mesh, the worker's own included; 0: see crew.h */
 	void (*ready)(void *ctx); /* called by the worker's thread: a result waits (or the worker failed) */
 	void *ctx;
@@ -36,7 +37,8 @@ struct worker_result {
 };
 
 struct worker_status {
-	size_t queued, queued_peak;     /* rows */
+	size_t queued, queued_peak; /* rows */
+	size_t rows_max;
 	uint64_t rows, refused, meshed; /* taken, refused, patches made */
 	bool idle;                      /* nothing is queued, being done or waiting to be taken */
 	bool failed; /* memory is out: the map is no longer whole and nothing more will be published */
@@ -50,7 +52,7 @@ void worker_destroy(struct worker *); /* ends after the patch at hand; what is q
 
 /* Takes the row over and is true, or false when the queue is full. */
 bool worker_row(struct worker *, struct row *, int64_t arrival_ns);
-/* Patient: false while WORKER_ROWS_MAX rows wait. What one record completes may still be handed over, so the queue is longer by
+/* Patient: false while `rows_max` rows wait. What one record completes may still be handed over, so the queue is longer by
  * that at most; `ready` is called when half of it is done. */
 bool worker_room(struct worker *);
 /* While it holds, rows are applied but nothing is meshed or handed over; then all of it at once. */

@@ -217,22 +217,15 @@ static int published_mean(const struct voxel *v)
 	return mean < 0 && mean >= -touching ? 0 : mean;
 }
 
-/* True when the published value changed. */
-static bool voxel_publish(struct voxel *v)
+/* What is to be published of a voxel: the old value where there is no news. */
+static int16_t published_after(const struct voxel *v)
 {
 	int mean;
 
-	if (v->weight < WEIGHT_KNOWN) {
-		bool was = v->published != VOXEL_UNKNOWN;
-
-		v->published = VOXEL_UNKNOWN;
-		return was;
-	}
+	if (v->weight < WEIGHT_KNOWN)
+		return VOXEL_UNKNOWN;
 	mean = published_mean(v);
-	if (v->published != VOXEL_UNKNOWN && abs(mean - v->published) < PUBLISH_STEP)
-		return false;
-	v->published = (int16_t)mean;
-	return true;
+	return v->published != VOXEL_UNKNOWN && abs(mean - v->published) < PUBLISH_STEP ? v->published : (int16_t)mean;
 }
 
 /* Folds one word (a layer of constant z) and empties its accumulators; the bits that changed. */
@@ -251,9 +244,11 @@ static uint64_t layer_fold(struct fold *fold, struct block *block, struct scratc
 		from->at[i] = 0;
 		from->rays[i] = 0;
 		negative = v->sum < 0 ? negative | bit : negative & ~bit;
-		if (voxel_publish(v)) {
+		const int16_t value = published_after(v);
+		if (value != v->published) {
+			block_publish(block, i, value);
 			changed |= bit;
-			fold->stats.cleared += v->published == VOXEL_UNKNOWN;
+			fold->stats.cleared += value == VOXEL_UNKNOWN;
 		}
 	}
 	from->seen[z] = from->passed[z] = 0;

@@ -26,7 +26,7 @@
 struct voxel {
 	int32_t sum;       /* of weight * distance; distance in 1/256 cell, positive before the surface */
 	uint16_t weight;   /* capped by scaling sum and weight together */
-	int16_t published; /* distance in 1/256 cell, or VOXEL_UNKNOWN: all a mesh ever reads */
+	int16_t published; /* distance in 1/256 cell, or VOXEL_UNKNOWN: all a mesh ever reads; see block_publish */
 };
 
 struct block_key {
@@ -41,8 +41,20 @@ struct block {
 	struct block_key key;
 	uint8_t layers[3]; /* kept by the field, as is `negative`: bit b where layer b along x, y, z has such a voxel */
 	uint64_t negative[BLOCK_SIDE]; /* bit y * 8 + x of word z: the sum is negative, so a ray may clear the voxel */
+	uint64_t known[BLOCK_SIDE], inside[BLOCK_SIDE]; /* as `negative`: published as known, as behind a surface */
 	struct voxel voxel[BLOCK_VOXELS]; /* index (z * 8 + y) * 8 + x */
 };
+
+/* Sets the published value of a voxel, by its index, with its bits. */
+static inline void block_publish(struct block *block, int index, int16_t value)
+{
+	const uint64_t bit = UINT64_C(1) << (index & 63);
+	const int z = index >> 6;
+
+	block->voxel[index].published = value;
+	block->known[z] = value != VOXEL_UNKNOWN ? block->known[z] | bit : block->known[z] & ~bit;
+	block->inside[z] = value != VOXEL_UNKNOWN && value < 0 ? block->inside[z] | bit : block->inside[z] & ~bit;
+}
 
 struct grid;
 

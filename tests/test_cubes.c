@@ -172,7 +172,7 @@ static void set_voxel(struct grid *grid, int i, int j, int k, int16_t value)
 	struct block_key key = {i >> BLOCK_SHIFT, j >> BLOCK_SHIFT, k >> BLOCK_SHIFT};
 	struct block *block = grid_touch(grid, key);
 	assert_non_null(block);
-	block->voxel[((k & 7) * BLOCK_SIDE + (j & 7)) * BLOCK_SIDE + (i & 7)].published = value;
+	block_publish(block, ((k & 7) * BLOCK_SIDE + (j & 7)) * BLOCK_SIDE + (i & 7), value);
 	grid_mark_changed(
 	    grid, key, (const uint8_t[3]){(uint8_t)(1 << (i & 7)), (uint8_t)(1 << (j & 7)), (uint8_t)(1 << (k & 7))});
 }

@@ -64,8 +64,13 @@ static uint64_t voxels_hash(const struct rig *rig)
 
 static void block_known(void *ctx, struct block *block)
 {
-	for (int i = 0; i < BLOCK_VOXELS; i++)
-		*(int *)ctx += block->voxel[i].published != VOXEL_UNKNOWN;
+	for (int i = 0; i < BLOCK_VOXELS; i++) {
+		const int16_t value = block->voxel[i].published;
+
+		*(int *)ctx += value != VOXEL_UNKNOWN;
+		assert_int_equal(block->known[i >> 6] >> (i & 63) & 1, value != VOXEL_UNKNOWN);
+		assert_int_equal(block->inside[i >> 6] >> (i & 63) & 1, value != VOXEL_UNKNOWN && value < 0);
+	}
 }
 
 static int known_voxels(const struct rig *rig)

@@ -19,7 +19,7 @@ static void change_voxel(struct grid *grid, int32_t i, int32_t j, int32_t k)
 	const uint8_t layers[3] = {1u << (i & 7), 1u << (j & 7), 1u << (k & 7)};
 
 	assert_non_null(block);
-	block->voxel[((k & 7) * 8 + (j & 7)) * 8 + (i & 7)].published = 1;
+	block_publish(block, ((k & 7) * 8 + (j & 7)) * 8 + (i & 7), 1);
 	grid_mark_changed(grid, block->key, layers);
 }
 
@@ -54,7 +54,7 @@ static void blocks_keep_their_place_and_content(void **state)
 
 		made[n] = grid_touch(grid, key);
 		made[n]->voxel[n % BLOCK_VOXELS].sum = n;
-		made[n]->voxel[n % BLOCK_VOXELS].published = (int16_t)n;
+		block_publish(made[n], n % BLOCK_VOXELS, (int16_t)n);
 	}
 	for (int n = 0; n < N; n++) {
 		struct block_key key = made[n]->key;

@@ -157,12 +157,12 @@ static void a_patch_that_loses_its_surface_becomes_a_tombstone(void **state)
 	struct patch_key key = {0, 0, 0};
 	struct block *block = grid_touch(map_grid(map), (struct block_key){0, 0, 0});
 	for (int v = 0; v < BLOCK_VOXELS; v++)
-		block->voxel[v].published = (int16_t)(((v >> 6) - 3) * 256 - 100);
+		block_publish(block, v, (int16_t)(((v >> 6) - 3) * 256 - 100));
 	grid_mark_changed(map_grid(map), block->key, (const uint8_t[3]){0xff, 0xff, 0xff});
 	mesh_dirty(map, mesher, store);
 	assert_int_equal(patch_store_count(store), 1);
 	for (int v = 0; v < BLOCK_VOXELS; v++)
-		block->voxel[v].published = VOXEL_UNKNOWN;
+		block_publish(block, v, VOXEL_UNKNOWN);
 	grid_mark_changed(map_grid(map), block->key, (const uint8_t[3]){0xff, 0xff, 0xff});
 	mesh_dirty(map, mesher, store);
 	assert_int_equal(patch_store_count(store), 0);
@@ -227,7 +227,7 @@ static void set_voxel(struct grid *grid, const int at[3], int16_t value)
 {
 	struct block_key key = {at[0] >> BLOCK_SHIFT, at[1] >> BLOCK_SHIFT, at[2] >> BLOCK_SHIFT};
 	struct block *block = grid_touch(grid, key);
-	block->voxel[((at[2] & 7) * BLOCK_SIDE + (at[1] & 7)) * BLOCK_SIDE + (at[0] & 7)].published = value;
+	block_publish(block, ((at[2] & 7) * BLOCK_SIDE + (at[1] & 7)) * BLOCK_SIDE + (at[0] & 7), value);
 	grid_mark_changed(
 	    grid, key,
 	    (const uint8_t[3]){(uint8_t)(1 << (at[0] & 7)), (uint8_t)(1 << (at[1] & 7)), (uint8_t)(1 << (at[2] & 7))});

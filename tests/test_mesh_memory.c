@@ -84,7 +84,7 @@ static int make_and_mesh(void)
 	int r = -1;
 	if (block && mesher) {
 		for (int v = 0; v < BLOCK_VOXELS; v++)
-			block->voxel[v].published = (int16_t)(((v & 7) - 3) * 256 - 100);
+			block_publish(block, v, (int16_t)(((v & 7) - 3) * 256 - 100));
 		const struct patch_key *keys;
 		grid_mark_changed(map_grid(map), block->key, (const uint8_t[3]){0xff, 0xff, 0xff});
 		map_take_dirty(map, &keys);

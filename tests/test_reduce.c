@@ -36,7 +36,7 @@ static void set_voxel(struct grid *grid, const int at[3], int16_t value)
 	int i = at[0] & 7, j = at[1] & 7, k = at[2] & 7;
 	const uint8_t layers[3] = {(uint8_t)(1 << i), (uint8_t)(1 << j), (uint8_t)(1 << k)};
 	assert_non_null(block);
-	block->voxel[(k * BLOCK_SIDE + j) * BLOCK_SIDE + i].published = value;
+	block_publish(block, (k * BLOCK_SIDE + j) * BLOCK_SIDE + i, value);
 	grid_mark_changed(grid, key, layers);
 }
 

@@ -20,7 +20,7 @@ static inline void window_set(struct grid *grid, int i, int j, int k, int value)
 	    grid_touch(grid, (struct block_key){i >> BLOCK_SHIFT, j >> BLOCK_SHIFT, k >> BLOCK_SHIFT});
 	if (value != VOXEL_UNKNOWN)
 		value = value > 768 ? 768 : value < -768 ? -768 : value;
-	block->voxel[((k & 7) * BLOCK_SIDE + (j & 7)) * BLOCK_SIDE + (i & 7)].published = (int16_t)value;
+	block_publish(block, ((k & 7) * BLOCK_SIDE + (j & 7)) * BLOCK_SIDE + (i & 7), (int16_t)value);
 }
 
 /* The window of patch 0,0,0. */

@@ -3,6 +3,7 @@
  * reset, which costs little since chunks double. */
 #include "core/arena.h"
 
+#include <stdbool.h>
 #include <stdint.h>
 #include <stdlib.h>
 #include <string.h>
@@ -66,14 +67,11 @@ static struct arena_chunk *chunk_append(struct arena *arena, size_t bytes)
 	return c;
 }
 
-void *arena_alloc(struct arena *arena, size_t n, size_t size)
+/* `bytes` is a multiple of ALIGNMENT. */
+static void *arena_push(struct arena *arena, size_t bytes)
 {
 	struct arena_chunk *c = arena->current;
-	size_t bytes;
 
-	if (size && n > (SIZE_MAX / 2 - ALIGNMENT) / size)
-		return NULL;
-	bytes = (n * size + ALIGNMENT - 1) & ~(size_t)(ALIGNMENT - 1);
 	while (c && c->size - c->used < bytes)
 		c = c->next;
 	if (!c)
@@ -87,5 +85,34 @@ void *arena_alloc(struct arena *arena, size_t n, size_t size)
 	arena->used += bytes;
 	if (arena->used > arena->peak)
 		arena->peak = arena->used;
-	return memset(p, 0, bytes);
+	return p;
+}
+
+/* False where the product overflows. */
+static bool round_up(size_t n, size_t size, size_t *ret_bytes)
+{
+	if (size && n > (SIZE_MAX / 2 - ALIGNMENT) / size)
+		return false;
+	*ret_bytes = (n * size + ALIGNMENT - 1) & ~(size_t)(ALIGNMENT - 1);
+	return true;
+}
+
+void *arena_take(struct arena *arena, size_t n, size_t size)
+{
+	size_t bytes;
+	void *p = round_up(n, size, &bytes) ? arena_push(arena, bytes) : NULL;
+
+#ifndef __OPTIMIZE__
+	if (p)
+		memset(p, 0xa5, bytes);
+#endif
+	return p;
+}
+
+void *arena_alloc(struct arena *arena, size_t n, size_t size)
+{
+	size_t bytes;
+	void *p = round_up(n, size, &bytes) ? arena_push(arena, bytes) : NULL;
+
+	return p ? memset(p, 0, bytes) : NULL;
 }

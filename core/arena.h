@@ -21,6 +21,11 @@ void arena_reset(struct arena *);
 /* `n` * `size` zeroed bytes, aligned to 16; NULL when memory is out (or n * size overflows). */
 void *arena_alloc(struct arena *, size_t n, size_t size);
 
-#define ARENA_NEW(arena, type, n) ((type *)arena_alloc((arena), (n), sizeof(type)))
+/* The same, but the bytes are what they were: for arrays whose every element is written before it is read. A build without
+ * optimisation fills them, so that one that is read too early shows. */
+void *arena_take(struct arena *, size_t n, size_t size);
+
+#define ARENA_TAKE(arena, type, n) ((type *)arena_take((arena), (n), sizeof(type)))
+#define ARENA_NEW(arena, type, n)  ((type *)arena_alloc((arena), (n), sizeof(type)))
 
 #endif

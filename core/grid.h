@@ -42,7 +42,7 @@ struct block {
 	uint8_t layers[3]; /* kept by the field, as is `negative`: bit b where layer b along x, y, z has such a voxel */
 	uint64_t negative[BLOCK_SIDE]; /* bit y * 8 + x of word z: the sum is negative, so a ray may clear the voxel */
 	uint64_t known[BLOCK_SIDE], inside[BLOCK_SIDE]; /* as `negative`: published as known, as behind a surface */
-	struct voxel voxel[BLOCK_VOXELS]; /* index (z * 8 + y) * 8 + x */
+	struct voxel voxel[BLOCK_VOXELS];               /* index (z * 8 + y) * 8 + x */
 };
 
 /* Sets the published value of a voxel, by its index, with its bits. */

@@ -47,6 +47,28 @@ static void pieces_do_not_overlap(void **state)
 	arena_finish(&arena);
 }
 
+static void taken_memory_is_aligned_and_counted_and_its_neighbours_are_zeroed(void **state)
+{
+	struct arena arena;
+
+	(void)state;
+	arena_init(&arena);
+	for (int round = 0; round < 3; round++) {
+		for (size_t n = 1; n < 300; n++) {
+			unsigned char *p = ARENA_TAKE(&arena, unsigned char, 7 * n);
+			size_t used = arena.used;
+
+			assert_true((uintptr_t)p % 16 == 0);
+			memset(p, 0xab, 7 * n);
+			assert_int_equal(*ARENA_NEW(&arena, unsigned char, 1), 0);
+			assert_int_equal(arena.used, used + 16);
+		}
+		arena_reset(&arena);
+	}
+	assert_null(arena_take(&arena, SIZE_MAX / 2, 3));
+	arena_finish(&arena);
+}
+
 static void steady_work_takes_no_new_memory(void **state)
 {
 	struct arena arena;
@@ -85,6 +107,7 @@ int main(void)
 	const struct CMUnitTest tests[] = {
 	    cmocka_unit_test(memory_is_zeroed_and_aligned_also_after_use),
 	    cmocka_unit_test(pieces_do_not_overlap),
+	    cmocka_unit_test(taken_memory_is_aligned_and_counted_and_its_neighbours_are_zeroed),
 	    cmocka_unit_test(steady_work_takes_no_new_memory),
 	    cmocka_unit_test(a_product_that_overflows_is_refused),
 	};

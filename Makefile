@@ -62,6 +62,7 @@ DAEMON := $(filter-out daemon/facetd.c,$(wildcard daemon/*.c))
 TOOLS := $(filter-out tools/facet.c,$(wildcard tools/*.c))
 TESTS := $(patsubst tests/%.c,%,$(wildcard tests/test_*.c))
 PROGRAMS := clients steps usb_bed gadget canopen_node angles
+BENCHES := $(patsubst bench/%.c,%,$(wildcard bench/*.c))
 RIGGED := $(filter test_rig test_cola_sessions test_matrix_% test_chaos test_servos test_snapshot,$(TESTS)) # they stand on tests/rig*.c
 THREADED := test_worker test_archive test_server test_replay test_modbus_bus test_sim_servo test_sim_drive test_client test_recorder
 FUZZ := $(patsubst tests/%.c,%,$(wildcard tests/fuzz_*.c))
@@ -70,7 +71,7 @@ LIBRARIES := $(B)/libtools.a $(B)/libdaemon.a $(B)/libdrivers.a $(B)/libconfig.a
 .SECONDARY:
 .PHONY: all tests check check-systemd check-vm check-vm-systemd demo bench soak fuzz lint format deps install clean help run-check run-demo needed
 all: needed $(B)/facetd $(B)/facet $(B)/libfacet.so.$(LIBFACET_ABI) $(B)/libfacet.a
-tests: needed $(addprefix $(B)/tests/,$(TESTS) $(PROGRAMS))
+tests: needed $(addprefix $(B)/tests/,$(TESTS) $(PROGRAMS)) $(addprefix $(B)/bench/,$(BENCHES))
 
 help:
 	@echo 'make [config=release|debug|sanitize|thread]   build/facetd and build/facet'
@@ -144,6 +145,10 @@ $(addprefix $(B)/tests/,$(PROGRAMS)): $(B)/tests/%: $(B)/obj/tests/%.o $(LIBRARI
 	@mkdir -p $(@D)
 	@echo '  LD   $@'
 	$(Q)$(CC) $(LDFLAGS_ALL) -o $@ $^ $(LIBS)
+$(B)/bench/%: $(B)/obj/bench/%.o $(LIBRARIES)
+	@mkdir -p $(@D)
+	@echo '  LD   $@'
+	$(Q)$(CC) $(LDFLAGS_ALL) -o $@ $^ $(LIBS)
 $(B)/tests/fuzz_%: $(B)/obj/tests/fuzz_%.o $(LIBRARIES)
 	@mkdir -p $(@D)
 	@echo '  LD   $@'
@@ -176,7 +181,7 @@ run-demo: all
 
 bench:
 	@tools/deps build check bench
-	@$(MAKE) --no-print-directory all
+	@$(MAKE) --no-print-directory all $(addprefix $(B)/bench/,$(BENCHES))
 	@bench/run
 
 soak: all tests

@@ -44,6 +44,8 @@ refused 2 'none of lms2xx, tim, lms1xx, lms5xx' hall --laser radar
 refused 2 'only lms1xx and lms5xx' hall --laser tim --encoder
 refused 2 '--laser is for worlds' uos:/nowhere --laser tim
 refused 2 '--endless is for worlds' uos:/nowhere --endless
+refused 2 '--sent: only the LMS2xx' hall --laser tim --sent /nowhere/sent
+refused 1 '--sent /nowhere/sent: No such file' hall --sent /nowhere/sent
 refused 2 'only the TiM has a USB port' hall --laser lms1xx --usb
 refused 2 '--http: .*not on loopback' hall --http 0.0.0.0:80
 refused 2 'world moves continuously' hall --speed 2

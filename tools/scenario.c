@@ -22,6 +22,7 @@
 #include "drivers/pose_line.h"
 #include "tools/output.h"
 #include "tools/scenario_motion.h"
+#include "tools/scenario_sent.h"
 #include "tools/scenario_truth.h"
 #include "tools/sim_control.h"
 #include "tools/sim_gadget.h"
@@ -43,6 +44,7 @@ struct scenario {
 	struct stage stage;
 	struct scenario_motion *motion;
 	struct scenario_truth *truth; /* NULL: not asked for */
+	struct scenario_sent *sent;   /* likewise */
 	struct sim_device laser;      /* the shell's; to be asked what it did */
 	struct sim_pty *laser_pty;
 	struct sim_tcp *laser_tcp;
@@ -157,6 +159,8 @@ static int start_laser(struct scenario *s, uv_loop_t *loop, char error[SCENARIO_
 		s->laser_usb = sim_gadget_create(loop, &s->laser, &usb, error);
 	else
 		s->laser_tcp = sim_tcp_create(loop, 0, &s->laser, error);
+	if (s->sent && s->laser_pty)
+		sim_pty_watch(s->laser_pty, scenario_sent_note, scenario_sent_of(s->sent, &s->laser));
 	return s->laser_pty || s->laser_tcp || s->laser_usb ? 0 : -EIO;
 }
 
@@ -171,7 +175,11 @@ static int start_devices(struct scenario *s, uv_loop_t *loop, char error[SCENARI
 	s->stage.join(s->stage.ctx, &axis, scenario_motion_servo(s->motion));
 	if (s->params.truth)
 		s->truth = scenario_truth_create(s->params.truth, wall_clock_read(CLOCK_MONOTONIC), error);
-	return s->params.truth && !s->truth ? -EIO : start_laser(s, loop, error);
+	if (s->params.sent)
+		s->sent = scenario_sent_create(s->params.sent, &s->stage.scene, error);
+	if ((s->params.truth && !s->truth) || (s->params.sent && !s->sent))
+		return -EIO;
+	return start_laser(s, loop, error);
 }
 
 /* ---- faults ---- */
@@ -345,6 +353,7 @@ void scenario_destroy(struct scenario *s)
 		sim_gadget_destroy(s->laser_usb);
 	scenario_motion_destroy(s->motion);
 	scenario_truth_destroy(s->truth);
+	scenario_sent_destroy(s->sent);
 	if (s->stage.destroy)
 		s->stage.destroy(s->stage.ctx);
 	if (s->pose_fd >= 0)

@@ -91,6 +91,7 @@ struct scenario_params {
 	const char *can;        /* a real interface where the nodes are; NULL: a hub at DIR/can.sock */
 	const char *can_config; /* ... and the one that the configuration names; NULL: the same */
 	const char *truth;      /* file, or NULL */
+	const char *sent;       /* likewise, LMS2xx only: its lines are those of scenario_sent.h */
 	bool usb;               /* the scanner on USB: the TiM, as root on a kernel with gadgets */
 	bool encoder;           /* the angle comes in the scanner's telegrams (LMS1xx, LMS5xx) */
 	bool endless;           /* the drive goes there and back again until it is ended */

@@ -33,6 +33,8 @@ struct sim_pty {
 	char *link;
 	uint8_t out[SIM_TRANSFER_MAX]; /* what the line did not take yet */
 	size_t out_len, out_sent;
+	void (*wrote)(void *ctx, int64_t t_ns); /* NULL: nobody asks */
+	void *wrote_ctx;
 };
 
 static const char *const kinds[] = {"unplug", NULL};
@@ -58,12 +60,15 @@ static void tell_baud(struct sim_pty *pty)
 /* True: the line takes more. */
 static bool write_out(struct sim_pty *pty)
 {
+	const int64_t t_ns = (int64_t)uv_hrtime(); /* who reads may be awake before the write returns */
 	const ssize_t n = write(pty->master, pty->out + pty->out_sent, pty->out_len - pty->out_sent);
 	if (n > 0)
 		pty->out_sent += (size_t)n;
 	if (pty->out_sent < pty->out_len)
 		return false;
 	pty->out_len = pty->out_sent = 0;
+	if (pty->wrote != NULL)
+		pty->wrote(pty->wrote_ctx, t_ns);
 	return true;
 }
 
@@ -269,6 +274,12 @@ void sim_pty_destroy(struct sim_pty *pty)
 	unplug(pty);
 	pty->device.destroy(pty->device.ctx);
 	uv_close((uv_handle_t *)&pty->timer, on_closed);
+}
+
+void sim_pty_watch(struct sim_pty *pty, void (*wrote)(void *ctx, int64_t t_ns), void *ctx)
+{
+	pty->wrote = wrote;
+	pty->wrote_ctx = ctx;
 }
 
 const char *const *sim_pty_fault_kinds(void)

@@ -41,7 +41,7 @@ struct options {
 	enum scenario_servo servo;
 	enum scenario_odometry odometry;
 	char can[64]; /* --can, cut at its colon: the configuration's interface follows */
-	const char *can_config, *truth;
+	const char *can_config, *truth, *sent;
 	bool fast, usb;
 	double speed;
 	uint64_t seed;
@@ -79,7 +79,8 @@ enum {
 	OPTION_ENDLESS,
 	OPTION_ODOMETRY,
 	OPTION_CAN,
-	OPTION_TRUTH
+	OPTION_TRUTH,
+	OPTION_SENT
 };
 
 static const struct argp_option option_list[] = {
@@ -99,6 +100,10 @@ static const struct argp_option option_list[] = {
      "the nodes are on this CAN interface instead of DIR/can.sock, facetd on OTHER (default: the same)", 0},
     {"truth", OPTION_TRUTH, "FILE", 0,
      "where axis and robot truly were: a line a millisecond, T (ns), ANGLE, X, Y, Z, YAW", 0},
+    {"sent", OPTION_SENT, "FILE", 0,
+     "when profiles left the LMS2xx: a line each, SENT (of the last byte) and MEASURED (of the first beam), ns of "
+     "CLOCK_MONOTONIC",
+     0},
     {"laser", OPTION_LASER, "lms2xx|tim|lms1xx|lms5xx", 0,
      "which scanner: a LMS2xx on a pseudo-terminal (default), or a TiM571, LMS111, LMS511 on TCP", 0},
     {"usb", OPTION_USB, 0, 0,
@@ -239,6 +244,9 @@ static error_t parse_option(int key, char *arg, struct argp_state *state)
 	case OPTION_TRUTH:
 		o->truth = arg;
 		return 0;
+	case OPTION_SENT:
+		o->sent = arg;
+		return 0;
 	case OPTION_FAULT:
 		parse_fault(state, arg, o);
 		return 0;
@@ -326,6 +334,8 @@ static void check(const struct options *o)
 		       "for worlds");
 	if (!world && (o->odometry != SCENARIO_NO_ODOMETRY || o->truth))
 		refuse("in recorded sweeps nothing moves by itself: --odometry and --truth are for worlds");
+	if (o->sent && o->laser != SCENARIO_LMS2XX)
+		refuse("--sent: only the LMS2xx tells when its bytes left");
 	if (!world && o->endless)
 		refuse("recorded sweeps end: --endless is for worlds");
 	if (o->usb && o->laser != SCENARIO_TIM)
@@ -591,6 +601,7 @@ static int simulate(struct simulation *s, struct options *o)
 	                                 .can = *o->can ? o->can : NULL,
 	                                 .can_config = o->can_config,
 	                                 .truth = o->truth,
+	                                 .sent = o->sent,
 	                                 .laser = o->laser,
 	                                 .encoder = o->encoder,
 	                                 .usb = o->usb,

@@ -41,6 +41,8 @@ struct sim_lms2xx_params {
  * when it fails: NULL with one sentence in `error`. */
 struct sim_pty;
 struct sim_pty *sim_pty_create(uv_loop_t *, const char *link, const struct sim_device *, char error[160]);
+/* `wrote` hears of every piece of bytes, all of which the line took, and of when they began to be written. */
+void sim_pty_watch(struct sim_pty *, void (*wrote)(void *ctx, int64_t t_ns), void *ctx);
 void sim_pty_destroy(struct sim_pty *); /* closes the pty, removes the link; the loop must run once more */
 /* The device's faults and the line's own: "unplug". False: no such kind. */
 bool sim_pty_fault(struct sim_pty *, const struct sim_fault *, bool on);

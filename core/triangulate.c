@@ -20,24 +20,38 @@
 
 #include "core/predicates.h"
 
-#define NONE         UINT32_MAX
-#define BUCKETS_SIDE 64 /* at most, a side */
-#define BRIDGE_TRIES 16 /* points of a hole; one that finds no bridge is rare */
+#define NONE          UINT32_MAX
+#define BUCKETS_SIDE  64 /* at most, a side */
+#define OCCUPIED_BITS 1024
+#define BRIDGE_TRIES  16 /* points of a hole; one that finds no bridge is rare */
+
+struct place {
+	int32_t where[2];
+	uint32_t point, next, previous; /* next: NONE once it was cut off */
+	uint32_t chain;                 /* next in its bucket */
+	uint8_t column, row;            /* its bucket */
+	bool left;                      /* it turns left; known once the buckets are filled */
+};
 
 struct ring {
-	const int32_t (*point)[2];
-	uint32_t *at, *next, *previous; /* per place; `at` is its point */
+	struct place *place;
 	uint32_t places;
 	triangulate_allows *allows;
 	const void *ctx;
-	uint32_t *bucket, *chain; /* places without a left turn: first of a bucket, next in it */
-	int32_t low[2], side;     /* of the buckets */
-	uint32_t columns, rows;
+	uint64_t occupied[OCCUPIED_BITS /
+	                  64]; /* a bit per hash of the coordinates that the outer loop and what was joined have */
+	uint32_t *bucket;      /* places without a left turn: first of a bucket */
+	uint32_t columns;
 };
 
 static const int32_t *where(const struct ring *ring, uint32_t place)
 {
-	return ring->point[ring->at[place]];
+	return ring->place[place].where;
+}
+
+static uint32_t occupied_bit(const int32_t p[2])
+{
+	return ((uint32_t)p[0] * 0x9e3779b1u + (uint32_t)p[1] * 0x85ebca6bu) >> 22; /* of OCCUPIED_BITS */
 }
 
 static bool same(const int32_t a[2], const int32_t b[2])
@@ -48,15 +62,23 @@ static bool same(const int32_t a[2], const int32_t b[2])
 /* Whether the direction from `place` to p lies strictly inside its angle. */
 static bool in_angle(const struct ring *ring, uint32_t place, const int32_t p[2])
 {
-	const int32_t *before = where(ring, ring->previous[place]), *at = where(ring, place);
-	const int32_t *after = where(ring, ring->next[place]);
+	const int32_t *before = where(ring, ring->place[place].previous), *at = where(ring, place);
+	const int32_t *after = where(ring, ring->place[place].next);
 	int64_t turn = orientation(before, at, after), in = orientation(before, at, p), out = orientation(at, after, p);
 	return turn > 0 ? in > 0 && out > 0 : in > 0 || out > 0;
+}
+
+/* Whether the boxes about two segments have nothing in common along an axis. */
+static bool apart(int32_t a, int32_t b, int32_t c, int32_t d)
+{
+	return (c > a) & (c > b) & (d > a) & (d > b) || (c < a) & (c < b) & (d < a) & (d < b);
 }
 
 /* Whether segment a-b has more in common with segment c-d than an end of both. */
 static bool blocks(const int32_t a[2], const int32_t b[2], const int32_t c[2], const int32_t d[2])
 {
+	if (apart(a[0], b[0], c[0], d[0]) || apart(a[1], b[1], c[1], d[1]))
+		return false;
 	if (same(a, c) || same(a, d)) {
 		const int32_t *far = same(a, c) ? d : c;
 		return !orientation(a, b, far) && (between(a, b, far) || between(a, far, b));
@@ -70,8 +92,8 @@ static bool blocks(const int32_t a[2], const int32_t b[2], const int32_t c[2], c
 
 static void link(struct ring *ring, uint32_t a, uint32_t b)
 {
-	ring->next[a] = b;
-	ring->previous[b] = a;
+	ring->place[a].next = b;
+	ring->place[b].previous = a;
 }
 
 /* Every loop as a ring of its own; place and point have the same number. */
@@ -79,7 +101,9 @@ static void lay_loops(const struct polygon *polygon, struct ring *ring)
 {
 	for (uint32_t l = 0, first = 0; l < polygon->loops; first = polygon->loop_end[l++])
 		for (uint32_t p = first; p < polygon->loop_end[l]; p++) {
-			ring->at[p] = p;
+			ring->place[p].point = p;
+			ring->place[p].where[0] = polygon->point[p][0];
+			ring->place[p].where[1] = polygon->point[p][1];
 			link(ring, p, p + 1 < polygon->loop_end[l] ? p + 1 : first);
 		}
 	ring->places = polygon->n;
@@ -90,10 +114,10 @@ static bool bridge_clear(const struct ring *ring, uint32_t from, uint32_t to, ui
 	const int32_t *a = where(ring, from), *b = where(ring, to);
 	if (!in_angle(ring, from, b) || !in_angle(ring, to, a))
 		return false;
-	if (ring->allows && !ring->allows(ring->ctx, ring->at[from], ring->at[to]))
+	if (ring->allows && !ring->allows(ring->ctx, ring->place[from].point, ring->place[to].point))
 		return false;
 	for (uint32_t p = 0; p < places; p++)
-		if (blocks(a, b, where(ring, p), where(ring, ring->next[p])))
+		if (blocks(a, b, where(ring, p), where(ring, ring->place[p].next)))
 			return false;
 	return true;
 }
@@ -103,16 +127,16 @@ static uint32_t touching_place(const struct ring *ring, uint32_t outer, uint32_t
 {
 	uint32_t p = outer;
 	do {
-		if (same(where(ring, p), where(ring, hole)) && in_angle(ring, p, where(ring, ring->next[hole])))
+		if (same(where(ring, p), where(ring, hole)) && in_angle(ring, p, where(ring, ring->place[hole].next)))
 			return p;
-		p = ring->next[p];
+		p = ring->place[p].next;
 	} while (p != outer);
 	return NONE;
 }
 
 static void splice(struct ring *ring, uint32_t outer, uint32_t hole)
 {
-	uint32_t outer_next = ring->next[outer], hole_next = ring->next[hole];
+	uint32_t outer_next = ring->place[outer].next, hole_next = ring->place[hole].next;
 	link(ring, outer, hole_next);
 	link(ring, hole, outer_next);
 }
@@ -120,10 +144,10 @@ static void splice(struct ring *ring, uint32_t outer, uint32_t hole)
 static void bridge(struct ring *ring, uint32_t outer, uint32_t hole)
 {
 	uint32_t outer_again = ring->places++, hole_again = ring->places++;
-	ring->at[outer_again] = ring->at[outer];
-	ring->at[hole_again] = ring->at[hole];
-	link(ring, outer_again, ring->next[outer]);
-	link(ring, hole_again, ring->next[hole]);
+	ring->place[outer_again] = ring->place[outer];
+	ring->place[hole_again] = ring->place[hole];
+	link(ring, outer_again, ring->place[outer].next);
+	link(ring, hole_again, ring->place[hole].next);
 	link(ring, outer, hole_again);
 	link(ring, hole, outer_again);
 }
@@ -141,23 +165,44 @@ static uint32_t next_nearest(const struct ring *ring, uint32_t outer, uint32_t h
 			*ret_distance = d;
 			best = p;
 		}
-		p = ring->next[p];
+		p = ring->place[p].next;
 	} while (p != outer);
 	return best;
 }
 
-static bool join_hole(struct ring *ring, uint32_t outer, uint32_t first)
+/* Notes where the loop through `first` has places. */
+static void occupy(struct ring *ring, uint32_t first)
 {
-	uint32_t hole = first, p = first;
-	do { /* a loop that touches the ring is spliced there */
-		uint32_t touching = touching_place(ring, outer, p);
+	uint32_t p = first;
+	do {
+		uint32_t bit = occupied_bit(where(ring, p));
+		ring->occupied[bit / 64] |= (uint64_t)1 << bit % 64;
+		p = ring->place[p].next;
+	} while (p != first);
+}
+
+/* Splices a loop that touches the ring there. */
+static bool join_touching(struct ring *ring, uint32_t outer, uint32_t first)
+{
+	uint32_t p = first;
+	do {
+		uint32_t bit = occupied_bit(where(ring, p)), touching = NONE;
+		if (ring->occupied[bit / 64] >> bit % 64 & 1)
+			touching = touching_place(ring, outer, p);
 		if (touching != NONE) {
 			splice(ring, touching, p);
 			return true;
 		}
-		p = ring->next[p];
+		p = ring->place[p].next;
 	} while (p != first);
-	uint32_t tries = 0;
+	return false;
+}
+
+static bool join_hole(struct ring *ring, uint32_t outer, uint32_t first)
+{
+	if (join_touching(ring, outer, first))
+		return true;
+	uint32_t hole = first, tries = 0;
 	do { /* from one of its points, the leftmost first */
 		int64_t distance = 0, next_distance;
 		for (uint32_t to = next_nearest(ring, outer, hole, 0, NONE, &next_distance); to != NONE;
@@ -168,7 +213,7 @@ static bool join_hole(struct ring *ring, uint32_t outer, uint32_t first)
 				return true;
 			}
 		}
-		hole = ring->next[hole];
+		hole = ring->place[hole].next;
 	} while (hole != first && ++tries < BRIDGE_TRIES);
 	return false;
 }
@@ -195,50 +240,61 @@ static int join_holes(const struct polygon *polygon, struct ring *ring, struct a
 			hole[k] = hole[k - 1];
 		hole[k] = best;
 	}
-	for (uint32_t k = 0; k < holes; k++)
+	occupy(ring, 0);
+	for (uint32_t k = 0; k < holes; k++) {
 		if (!join_hole(ring, 0, hole[k]))
 			return -EDOM;
+		if (k + 1 < holes)
+			occupy(ring, hole[k]); /* which goes once around the whole ring now */
+	}
 	return 0;
 }
 
 static bool turns_left(const struct ring *ring, uint32_t place)
 {
-	return orientation(where(ring, ring->previous[place]), where(ring, place), where(ring, ring->next[place])) > 0;
+	return orientation(where(ring, ring->place[place].previous), where(ring, place),
+	                   where(ring, ring->place[place].next)) > 0;
 }
 
-static uint32_t bucket_of(const struct ring *ring, int axis, int32_t coordinate)
+/* The lowest of both coordinates, and the larger of the two extents. */
+static int32_t extent(const struct ring *ring, int32_t ret_low[2])
 {
-	return (uint32_t)((coordinate - ring->low[axis]) / ring->side);
-}
-
-static int fill_buckets(struct ring *ring, struct arena *arena)
-{
-	int32_t high[2];
+	int32_t most = 0;
 	for (int axis = 0; axis < 2; axis++) {
-		ring->low[axis] = high[axis] = where(ring, 0)[axis];
+		int32_t low = where(ring, 0)[axis], high = low;
 		for (uint32_t p = 1; p < ring->places; p++) {
 			int32_t c = where(ring, p)[axis];
-			ring->low[axis] = c < ring->low[axis] ? c : ring->low[axis];
-			high[axis] = c > high[axis] ? c : high[axis];
+			low = c < low ? c : low;
+			high = c > high ? c : high;
 		}
+		ret_low[axis] = low;
+		most = high - low > most ? high - low : most;
 	}
-	int32_t width = high[0] - ring->low[0], height = high[1] - ring->low[1], sides = 1;
+	return most;
+}
+
+/* Buckets have a power of two as their side: every place is given its own once, by shifts. */
+static int fill_buckets(struct ring *ring, struct arena *arena)
+{
+	int32_t low[2], most = extent(ring, low), sides = 1, shift = 0;
 	while (sides < BUCKETS_SIDE && (uint32_t)(sides * sides) < ring->places / 2)
 		sides++;
-	ring->side = (width > height ? width : height) / sides + 1;
-	ring->columns = bucket_of(ring, 0, high[0]) + 1;
-	ring->rows = bucket_of(ring, 1, high[1]) + 1;
-	ring->bucket = ARENA_NEW(arena, uint32_t, ring->columns * ring->rows);
-	ring->chain = ARENA_NEW(arena, uint32_t, ring->places);
-	if (!ring->bucket || !ring->chain)
+	while (most >> shift >= sides)
+		shift++;
+	ring->columns = (uint32_t)(most >> shift) + 1;
+	ring->bucket = ARENA_NEW(arena, uint32_t, ring->columns * ring->columns);
+	if (!ring->bucket)
 		return -ENOMEM;
-	memset(ring->bucket, 0xff, ring->columns * ring->rows * sizeof *ring->bucket);
+	memset(ring->bucket, 0xff, ring->columns * ring->columns * sizeof *ring->bucket);
 	for (uint32_t p = 0; p < ring->places; p++) {
-		if (turns_left(ring, p))
+		struct place *place = &ring->place[p];
+		place->column = (uint8_t)((place->where[0] - low[0]) >> shift);
+		place->row = (uint8_t)((place->where[1] - low[1]) >> shift);
+		place->left = turns_left(ring, p);
+		if (place->left)
 			continue;
-		uint32_t b =
-		    bucket_of(ring, 1, where(ring, p)[1]) * ring->columns + bucket_of(ring, 0, where(ring, p)[0]);
-		ring->chain[p] = ring->bucket[b];
+		uint32_t b = place->row * ring->columns + place->column;
+		place->chain = ring->bucket[b];
 		ring->bucket[b] = p;
 	}
 	return 0;
@@ -248,81 +304,85 @@ static int fill_buckets(struct ring *ring, struct arena *arena)
 static bool bucket_blocks(struct ring *ring, uint32_t b, const int32_t a[2], const int32_t t[2], const int32_t c[2])
 {
 	for (uint32_t *slot = &ring->bucket[b]; *slot != NONE;) {
-		uint32_t p = *slot;
-		if (ring->next[p] == NONE || turns_left(ring, p)) {
-			*slot = ring->chain[p];
+		struct place *place = &ring->place[*slot];
+		const int32_t *at = place->where;
+		if (place->next == NONE || place->left) {
+			*slot = place->chain;
 			continue;
 		}
-		const int32_t *at = where(ring, p);
 		if (orientation(a, t, at) >= 0 && orientation(t, c, at) >= 0 && orientation(c, a, at) >= 0 &&
 		    !same(at, a) && !same(at, t) && !same(at, c))
 			return true;
-		slot = &ring->chain[p];
+		slot = &place->chain;
 	}
 	return false;
 }
 
-static int32_t least(int32_t a, int32_t b, int32_t c)
+static uint8_t least(uint8_t a, uint8_t b, uint8_t c)
 {
-	int32_t m = a < b ? a : b;
+	uint8_t m = a < b ? a : b;
 	return m < c ? m : c;
 }
 
-static int32_t most(int32_t a, int32_t b, int32_t c)
+static uint8_t most(uint8_t a, uint8_t b, uint8_t c)
 {
-	int32_t m = a > b ? a : b;
+	uint8_t m = a > b ? a : b;
 	return m > c ? m : c;
 }
 
-static bool triangle_blocked(struct ring *ring, const int32_t a[2], const int32_t t[2], const int32_t c[2])
+static bool triangle_blocked(struct ring *ring, const struct place *a, const struct place *t, const struct place *c)
 {
-	uint32_t left = bucket_of(ring, 0, least(a[0], t[0], c[0])), right = bucket_of(ring, 0, most(a[0], t[0], c[0]));
-	uint32_t low = bucket_of(ring, 1, least(a[1], t[1], c[1])), high = bucket_of(ring, 1, most(a[1], t[1], c[1]));
+	uint32_t left = least(a->column, t->column, c->column), right = most(a->column, t->column, c->column);
+	uint32_t low = least(a->row, t->row, c->row), high = most(a->row, t->row, c->row);
 	for (uint32_t row = low; row <= high; row++)
 		for (uint32_t column = left; column <= right; column++)
-			if (bucket_blocks(ring, row * ring->columns + column, a, t, c))
+			if (bucket_blocks(ring, row * ring->columns + column, a->where, t->where, c->where))
 				return true;
 	return false;
 }
 
+/* The tip turns left, so the diagonal lies to the inner side of it at both ends; what remains of their angles is the other
+ * side, and none of that at an end without a left turn. */
 static bool is_ear(struct ring *ring, uint32_t tip)
 {
-	uint32_t before = ring->previous[tip], after = ring->next[tip];
-	const int32_t *a = where(ring, before), *t = where(ring, tip), *c = where(ring, after);
-	if (orientation(a, t, c) <= 0 || !in_angle(ring, before, c) || !in_angle(ring, after, a))
+	const struct place *t = &ring->place[tip], *a = &ring->place[t->previous], *c = &ring->place[t->next];
+	if (!t->left || (a->left && orientation(where(ring, a->previous), a->where, c->where) <= 0) ||
+	    (c->left && orientation(c->where, where(ring, c->next), a->where) <= 0))
 		return false;
 	if (triangle_blocked(ring, a, t, c))
 		return false;
-	return !ring->allows || ring->allows(ring->ctx, ring->at[before], ring->at[after]);
+	return !ring->allows || ring->allows(ring->ctx, a->point, c->point);
 }
 
 static int cut_ears(struct ring *ring, uint32_t (*triangle)[3], uint32_t *ret_n)
 {
 	uint32_t n = 0, left = 1, since = 0, tip = 0;
-	for (uint32_t p = ring->next[0]; p != 0; p = ring->next[p])
+	for (uint32_t p = ring->place[0].next; p != 0; p = ring->place[p].next)
 		left++;
 	while (left > 3) {
-		uint32_t before = ring->previous[tip], after = ring->next[tip];
+		uint32_t before = ring->place[tip].previous, after = ring->place[tip].next;
 		if (!is_ear(ring, tip)) {
 			tip = after;
 			if (++since > left)
 				return -EDOM;
 			continue;
 		}
-		triangle[n][0] = ring->at[before];
-		triangle[n][1] = ring->at[tip];
-		triangle[n++][2] = ring->at[after];
+		triangle[n][0] = ring->place[before].point;
+		triangle[n][1] = ring->place[tip].point;
+		triangle[n++][2] = ring->place[after].point;
 		link(ring, before, after);
-		ring->next[tip] = NONE;
-		tip = ring->next[after]; /* not the next one: fans make slivers */
+		ring->place[tip].next = NONE;
+		ring->place[before].left = turns_left(ring, before);
+		ring->place[after].left = turns_left(ring, after);
+		tip = ring->place[after].next; /* not the next one: fans make slivers */
 		since = 0;
 		left--;
 	}
 	if (!turns_left(ring, tip))
 		return -EDOM;
-	triangle[n][0] = ring->at[ring->previous[tip]];
-	triangle[n][1] = ring->at[tip];
-	triangle[n++][2] = ring->at[ring->next[tip]];
+	triangle[n][0] = ring->place[ring->place[tip].previous].point;
+	triangle[n][1] = ring->place[tip].point;
+	triangle[n++][2] = ring->place[ring->place[tip].next].point;
 	*ret_n = n;
 	return 0;
 }
@@ -331,18 +391,16 @@ int triangulate(const struct polygon *polygon, triangulate_allows *allows, const
                 uint32_t (**ret_triangle)[3], uint32_t *ret_n)
 {
 	assert(polygon->loops > 0 && polygon->loop_end[polygon->loops - 1] == polygon->n);
-	struct ring ring = {.point = polygon->point, .allows = allows, .ctx = ctx};
+	struct ring ring = {.allows = allows, .ctx = ctx};
 	uint32_t places = polygon->n + 2 * (polygon->loops - 1);
 	if (polygon->n < 3)
 		return -EDOM;
-	ring.at = ARENA_NEW(arena, uint32_t, places);
-	ring.next = ARENA_NEW(arena, uint32_t, places);
-	ring.previous = ARENA_NEW(arena, uint32_t, places);
+	ring.place = ARENA_NEW(arena, struct place, places);
 	uint32_t(*triangle)[3] = arena_alloc(arena, places, sizeof *triangle);
-	if (!ring.at || !ring.next || !ring.previous || !triangle)
+	if (!ring.place || !triangle)
 		return -ENOMEM;
 	lay_loops(polygon, &ring);
-	int r = join_holes(polygon, &ring, arena);
+	int r = polygon->loops > 1 ? join_holes(polygon, &ring, arena) : 0;
 	if (!r)
 		r = fill_buckets(&ring, arena);
 	if (!r)

@@ -30,15 +30,23 @@
 #define COSINE_WITHIN 0.5  /* 60 degrees */
 #define FLIPS_MAX     8    /* per edge, against rings of equal circles */
 
+/* Between these the square of theta swallows the 1 that Jacobi adds to it, and that of t is swallowed: the roots need not be
+ * taken, the bits are the same. */
+#define THETA_LARGE 0x1p28
+#define THETA_HUGE  0x1p500
+
 struct grower {
 	struct simplify *s;
 	struct arena *arena;
-	struct vec3 *normal;   /* [nt] unit */
-	uint32_t *region;      /* [cap_nt] number, or NONE */
-	uint32_t *taken, n;    /* triangles of the region that grows */
-	uint32_t *vertex, nv;  /* its vertices */
-	uint32_t *seen, stamp; /* [nv] */
-	struct vec3 *point;    /* scratch of fits */
+	struct vec3 *place;      /* [nv] */
+	struct vec3 *normal;     /* [nt] unit */
+	uint32_t *region;        /* [cap_nt] number, or NONE */
+	uint32_t *taken, n;      /* triangles of the region that grows */
+	uint32_t *vertex, nv;    /* its vertices */
+	uint32_t *seen, stamp;   /* [nv] */
+	int32_t (*projected)[2]; /* [nv] vertices of the region in its plane */
+	bool *settled;           /* [3 nt] half-edges that Delaunay keeps */
+	struct vec3 *point;      /* scratch of fits */
 	double slab;
 	struct region_plane plane;
 	int axis; /* the dominant one, left out in the projection */
@@ -50,9 +58,14 @@ static void rotate(double m[3][3], double v[3][3], int p, int q)
 {
 	if (m[p][q] == 0)
 		return;
-	double theta = (m[q][q] - m[p][p]) / (2 * m[p][q]);
-	double t = (theta >= 0 ? 1 : -1) / (fabs(theta) + sqrt(theta * theta + 1));
-	double c = 1 / sqrt(t * t + 1), s = t * c;
+	double theta = (m[q][q] - m[p][p]) / (2 * m[p][q]), size = fabs(theta), t, c = 1;
+	if (size > THETA_LARGE && size < THETA_HUGE) {
+		t = 0.5 / theta;
+	} else {
+		t = (theta >= 0 ? 1 : -1) / (size + sqrt(theta * theta + 1));
+		c = 1 / sqrt(t * t + 1);
+	}
+	double s = t * c;
 	for (int k = 0; k < 3; k++) {
 		double a = m[k][p], b = m[k][q];
 		m[k][p] = c * a - s * b;
@@ -108,16 +121,18 @@ static double height(const struct region_plane *plane, struct vec3 p)
 /* Smoothing moves vertices, and errors are measured from where they were: both places count. */
 static bool in_slab(const struct grower *g, uint32_t v)
 {
-	return fabs(height(&g->plane, simplify_place(g->s, v))) <= g->slab &&
-	       fabs(height(&g->plane, g->s->origin[v])) <= g->slab;
+	return fabs(height(&g->plane, g->place[v])) <= g->slab && fabs(height(&g->plane, g->s->origin[v])) <= g->slab;
 }
 
-static void project(const struct grower *g, uint32_t v, int32_t ret_point[2])
+static void project_vertices(struct grower *g)
 {
-	const int32_t *p = g->s->mesh.position[v];
 	int first = (g->axis + 1) % 3, second = (g->axis + 2) % 3;
-	ret_point[0] = p[g->mirrored ? second : first];
-	ret_point[1] = p[g->mirrored ? first : second];
+	for (uint32_t k = 0; k < g->nv; k++) {
+		const int32_t *p = g->s->mesh.position[g->vertex[k]];
+		int32_t *at = g->projected[g->vertex[k]];
+		at[0] = p[g->mirrored ? second : first];
+		at[1] = p[g->mirrored ? first : second];
+	}
 }
 
 static double component(struct vec3 v, int axis)
@@ -125,13 +140,18 @@ static double component(struct vec3 v, int axis)
 	return axis == 0 ? v.x : axis == 1 ? v.y : v.z;
 }
 
-static bool fits(const struct grower *g, uint32_t t)
+/* Whether triangle t is in no region and turned the plane's way. */
+static bool turned_alike(const struct grower *g, uint32_t t)
 {
-	const struct halfedge_mesh *mesh = &g->s->mesh;
 	double along = component(g->normal[t], g->axis);
 	return g->region[t] == NONE && vec3_dot(g->normal[t], g->plane.normal) >= COSINE_WITHIN &&
-	       (g->mirrored ? along < 0 : along > 0) && in_slab(g, mesh->origin[3 * t]) &&
-	       in_slab(g, mesh->origin[3 * t + 1]) && in_slab(g, mesh->origin[3 * t + 2]);
+	       (g->mirrored ? along < 0 : along > 0);
+}
+
+static bool fits(const struct grower *g, uint32_t t)
+{
+	const uint32_t *corner = &g->s->mesh.origin[3 * t];
+	return turned_alike(g, t) && in_slab(g, corner[0]) && in_slab(g, corner[1]) && in_slab(g, corner[2]);
 }
 
 static void choose_axis(struct grower *g)
@@ -142,30 +162,39 @@ static void choose_axis(struct grower *g)
 	g->mirrored = component(n, g->axis) < 0;
 }
 
+static void take_vertex(struct grower *g, uint32_t v)
+{
+	g->seen[v] = g->stamp;
+	g->vertex[g->nv++] = v;
+}
+
 static void take(struct grower *g, uint32_t t, uint32_t number)
 {
 	g->region[t] = number;
 	g->taken[g->n++] = t;
-	for (int k = 0; k < 3; k++) {
-		uint32_t v = g->s->mesh.origin[3 * t + k];
-		if (g->seen[v] == g->stamp)
-			continue;
-		g->seen[v] = g->stamp;
-		g->vertex[g->nv++] = v;
-	}
 }
 
+/* From triangle `from`, which fits. Of a neighbour only the far corner is new; one seen before lies in the slab. */
 static void grow(struct grower *g, uint32_t from, uint32_t number)
 {
 	const struct halfedge_mesh *mesh = &g->s->mesh;
 	g->n = g->nv = 0;
 	g->stamp++;
 	take(g, from, number);
+	for (int k = 0; k < 3; k++)
+		take_vertex(g, mesh->origin[3 * from + k]);
 	for (uint32_t k = 0; k < g->n; k++)
 		for (uint32_t h = 3 * g->taken[k]; h < 3 * g->taken[k] + 3; h++) {
 			uint32_t twin = mesh->twin[h];
-			if (twin != HALFEDGE_NONE && fits(g, twin / 3))
-				take(g, twin / 3, number);
+			if (twin == HALFEDGE_NONE || !turned_alike(g, twin / 3))
+				continue;
+			uint32_t far = mesh->origin[halfedge_previous(twin)];
+			if (g->seen[far] != g->stamp) {
+				if (!in_slab(g, far))
+					continue;
+				take_vertex(g, far);
+			}
+			take(g, twin / 3, number);
 		}
 }
 
@@ -180,7 +209,7 @@ static double fit(struct grower *g, const uint32_t *vertex, uint32_t n, uint32_t
 {
 	double variance;
 	for (uint32_t k = 0; k < n; k++)
-		g->point[k] = simplify_place(g->s, vertex[k]);
+		g->point[k] = g->place[vertex[k]];
 	g->plane = region_fit(g->point, n, &variance);
 	if (vec3_dot(g->plane.normal, g->normal[t]) < 0)
 		g->plane = (struct region_plane){vec3_scale(g->plane.normal, -1), -g->plane.offset};
@@ -213,6 +242,13 @@ static int64_t loop_area(const struct outline *outline, uint32_t first, uint32_t
 	return sum;
 }
 
+static void place_outline(struct outline *outline)
+{
+	const struct contour *c = &outline->contour;
+	for (uint32_t k = 0; k < c->n; k++)
+		memcpy(outline->point[k], outline->g->projected[c->vertex[k]], sizeof outline->point[k]);
+}
+
 /* Puts the outer loop first. False where there is not exactly one. */
 static bool order_loops(struct outline *outline, struct arena *arena)
 {
@@ -239,33 +275,39 @@ static bool order_loops(struct outline *outline, struct arena *arena)
 		sorted.loop_end[k] = sorted.n;
 	}
 	*c = sorted;
-	for (uint32_t k = 0; k < c->n; k++)
-		project(outline->g, c->vertex[k], outline->point[k]);
+	place_outline(outline);
 	return true;
 }
 
-static void corners(const struct grower *g, uint32_t t, int32_t ret_point[3][2])
+/* The edges of triangle t are to be looked at, from either side. */
+static void want_look(struct grower *g, uint32_t t)
 {
-	for (int k = 0; k < 3; k++)
-		project(g, g->s->mesh.origin[3 * t + k], ret_point[k]);
+	for (uint32_t h = 3 * t; h < 3 * t + 3; h++) {
+		g->settled[h] = false;
+		if (g->s->mesh.twin[h] != HALFEDGE_NONE)
+			g->settled[g->s->mesh.twin[h]] = false;
+	}
 }
 
-/* Turns the edge of h to the other diagonal of its two triangles where Delaunay wants it and it is allowed. */
+/* Turns the edge of h to the other diagonal of its two triangles where Delaunay wants it and it is allowed. An edge that
+ * Delaunay keeps is settled, on both sides, until one of its triangles changes. */
 static bool flip(struct grower *g, uint32_t h)
 {
 	struct halfedge_mesh *mesh = &g->s->mesh;
 	uint32_t twin = mesh->twin[h];
-	if (twin == HALFEDGE_NONE || g->region[twin / 3] != g->region[h / 3])
+	if (g->settled[h])
 		return false;
+	if (twin == HALFEDGE_NONE || g->region[twin / 3] != g->region[h / 3]) {
+		g->settled[h] = true;
+		return false;
+	}
 	uint32_t a = mesh->origin[h], b = mesh->origin[twin];
 	uint32_t c = mesh->origin[halfedge_previous(h)], d = mesh->origin[halfedge_previous(twin)];
-	int32_t pa[2], pb[2], pc[2], pd[2];
-	project(g, a, pa);
-	project(g, b, pb);
-	project(g, c, pc);
-	project(g, d, pd);
-	if (in_circle(pa, pb, pc, pd) <= 0 || orientation(pc, pa, pd) <= 0 || orientation(pd, pb, pc) <= 0)
+	const int32_t *pa = g->projected[a], *pb = g->projected[b], *pc = g->projected[c], *pd = g->projected[d];
+	if (in_circle(pa, pb, pc, pd) <= 0 || orientation(pc, pa, pd) <= 0 || orientation(pd, pb, pc) <= 0) {
+		g->settled[h] = g->settled[twin] = true;
 		return false;
+	}
 	const uint8_t *faces = g->s->border.faces;
 	if ((faces[c] & faces[d]) || c == d || halfedge_joined(mesh, c, d))
 		return false;
@@ -274,6 +316,8 @@ static bool flip(struct grower *g, uint32_t h)
 	halfedge_remove(mesh, second);
 	halfedge_add(mesh, first, c, a, d);
 	halfedge_add(mesh, second, d, b, c);
+	want_look(g, first);
+	want_look(g, second);
 	return true;
 }
 
@@ -287,27 +331,68 @@ static void make_delaunay(struct grower *g, const uint32_t *slot, uint32_t n)
 	}
 }
 
+/* A triangle of the outline as its three half-planes: coefficients of x, y and 1, none negative inside. */
+struct cover {
+	int32_t edge[3][3];
+	bool made; /* `flat` is */
+	struct flat flat;
+};
+
+static struct cover cover_make(const struct grower *g, uint32_t t)
+{
+	struct cover cover = {.made = false};
+	const uint32_t *corner = &g->s->mesh.origin[3 * t];
+	for (int k = 0; k < 3; k++) {
+		const int32_t *a = g->projected[corner[k]], *b = g->projected[corner[(k + 1) % 3]];
+		cover.edge[k][0] = a[1] - b[1];
+		cover.edge[k][1] = b[0] - a[0];
+		cover.edge[k][2] = a[0] * b[1] - a[1] * b[0];
+	}
+	return cover;
+}
+
+/* Sides are taken together: which one refuses is a coin's toss that no processor foresees. */
+static bool covers(const struct cover *cover, const int32_t p[2])
+{
+	int32_t side[3];
+	for (int k = 0; k < 3; k++)
+		side[k] = cover->edge[k][0] * p[0] + cover->edge[k][1] * p[1] + cover->edge[k][2];
+	return (side[0] | side[1] | side[2]) >= 0;
+}
+
 /* Gives vertex v, which went, to the triangle over or under it; false where that is farther than the tolerance. */
-static bool hand_over(struct grower *g, uint32_t v, const uint32_t *slot, uint32_t n)
+static bool hand_over(struct grower *g, uint32_t v, struct cover *cover, uint32_t n)
 {
 	struct simplify *s = g->s;
-	int32_t p[2], corner[3][2];
-	project(g, v, p);
 	for (uint32_t k = 0; k < n; k++) {
-		const uint32_t *at = &s->mesh.origin[3 * slot[k]];
-		corners(g, slot[k], corner);
-		if (orientation(corner[0], corner[1], p) < 0 || orientation(corner[1], corner[2], p) < 0 ||
-		    orientation(corner[2], corner[0], p) < 0)
+		if (!covers(&cover[k], g->projected[v]))
 			continue;
-		struct flat flat =
-		    flat_make(simplify_place(s, at[0]), simplify_place(s, at[1]), simplify_place(s, at[2]));
-		if (flat_distance_squared(&flat, s->origin[v]) > s->tolerance_squared)
+		uint32_t t = g->taken[k];
+		const uint32_t *corner = &s->mesh.origin[3 * t];
+		if (!cover[k].made)
+			cover[k].flat = flat_make(g->place[corner[0]], g->place[corner[1]], g->place[corner[2]]);
+		cover[k].made = true;
+		if (flat_distance_squared(&cover[k].flat, s->origin[v]) > s->tolerance_squared)
 			continue;
-		s->next_point[v] = s->points[slot[k]];
-		s->points[slot[k]] = v;
+		s->next_point[v] = s->points[t];
+		s->points[t] = v;
 		return true;
 	}
 	return false;
+}
+
+/* The vertices that went, in the triangles that came: the first `n` slots. 0, -EDOM or -ENOMEM. */
+static int hand_over_all(struct grower *g, uint32_t n)
+{
+	struct cover *cover = ARENA_NEW(g->arena, struct cover, n);
+	if (!cover)
+		return -ENOMEM;
+	for (uint32_t k = 0; k < n; k++)
+		cover[k] = cover_make(g, g->taken[k]);
+	for (uint32_t k = 0; k < g->nv; k++)
+		if (g->s->mesh.first[g->vertex[k]] == HALFEDGE_NONE && !hand_over(g, g->vertex[k], cover, n))
+			return -EDOM;
+	return 0;
 }
 
 static void restore(struct grower *g, uint32_t (*before)[3])
@@ -321,9 +406,30 @@ static void restore(struct grower *g, uint32_t (*before)[3])
 		halfedge_add(&g->s->mesh, g->taken[k], before[k][0], before[k][1], before[k][2]);
 }
 
-/* Replaces the triangles of the region, all removed already, by those of its outline; false where a vertex that goes
- * would be too far from them. */
-static bool replace(struct grower *g, const struct outline *outline, uint32_t (*triangle)[3], uint32_t n)
+/* Takes the triangles of the region out of the mesh: as halfedge_remove does one by one, but walks each list once. */
+static void remove_all(struct grower *g, uint32_t number)
+{
+	struct halfedge_mesh *mesh = &g->s->mesh;
+	for (uint32_t k = 0; k < g->nv; k++) {
+		uint32_t *link = &mesh->first[g->vertex[k]];
+		for (uint32_t h = *link; h != HALFEDGE_NONE; h = mesh->next_leaving[h])
+			if (g->region[h / 3] != number) {
+				*link = h;
+				link = &mesh->next_leaving[h];
+			}
+		*link = HALFEDGE_NONE;
+	}
+	for (uint32_t k = 0; k < g->n; k++)
+		for (uint32_t h = 3 * g->taken[k]; h < 3 * g->taken[k] + 3; h++) {
+			if (mesh->twin[h] != HALFEDGE_NONE)
+				mesh->twin[mesh->twin[h]] = HALFEDGE_NONE;
+			mesh->origin[h] = mesh->twin[h] = HALFEDGE_NONE;
+		}
+}
+
+/* Replaces the triangles of the region, all removed already, by those of its outline. -EDOM where a vertex that goes would
+ * be too far from them. */
+static int replace(struct grower *g, const struct outline *outline, uint32_t (*triangle)[3], uint32_t n)
 {
 	struct simplify *s = g->s;
 	const uint32_t *vertex = outline->contour.vertex;
@@ -331,10 +437,7 @@ static bool replace(struct grower *g, const struct outline *outline, uint32_t (*
 		halfedge_add(&s->mesh, g->taken[k], vertex[triangle[k][0]], vertex[triangle[k][1]],
 		             vertex[triangle[k][2]]);
 	make_delaunay(g, g->taken, n);
-	for (uint32_t k = 0; k < g->nv; k++)
-		if (s->mesh.first[g->vertex[k]] == HALFEDGE_NONE && !hand_over(g, g->vertex[k], g->taken, n))
-			return false;
-	return true;
+	return hand_over_all(g, n);
 }
 
 /* Triangulates the region from its outline. 0; -EDOM where that cannot be, the region is then as before; -ENOMEM. */
@@ -345,23 +448,22 @@ static int flatten(struct grower *g, uint32_t number)
 	int r = contour_find(mesh, g->taken, g->n, g->region, number, g->arena, &outline.contour);
 	if (r)
 		return r;
+	project_vertices(g);
 	outline.point = arena_alloc(g->arena, outline.contour.n, sizeof *outline.point);
 	uint32_t(*before)[3] = arena_alloc(g->arena, g->n, sizeof *before), (*triangle)[3], n;
 	if (!outline.point || !before)
 		return -ENOMEM;
-	for (uint32_t k = 0; k < outline.contour.n; k++)
-		project(g, outline.contour.vertex[k], outline.point[k]);
+	place_outline(&outline);
 	if (!order_loops(&outline, g->arena) || outline.contour.n < 4)
 		return -EDOM;
-	for (uint32_t k = 0; k < g->n; k++) {
+	for (uint32_t k = 0; k < g->n; k++)
 		memcpy(before[k], &mesh->origin[3 * g->taken[k]], sizeof before[k]);
-		halfedge_remove(mesh, g->taken[k]);
-	}
+	remove_all(g, number);
 	const struct polygon polygon = {(const int32_t(*)[2])outline.point, outline.contour.loop_end, outline.contour.n,
 	                                outline.contour.loops};
 	r = triangulate(&polygon, allows, &outline, g->arena, &triangle, &n);
-	if (!r && !replace(g, &outline, triangle, n))
-		r = -EDOM;
+	if (!r)
+		r = replace(g, &outline, triangle, n);
 	if (r)
 		restore(g, before);
 	return r;
@@ -402,45 +504,55 @@ static int note_region(struct grower *g, uint32_t number, struct reduce_stats *s
 struct bins {
 	uint32_t first[BINS + 1]; /* of `triangle` */
 	uint32_t *triangle;
-	uint32_t count[BINS]; /* vertices */
-	uint32_t order[BINS];
+	uint32_t order[BINS], n; /* those with vertices enough to be tried */
 };
 
-static uint32_t bin_of(const struct simplify *s, uint32_t v)
+static uint8_t bin_of(const struct simplify *s, uint32_t v)
 {
 	uint32_t at[3];
 	for (int axis = 0; axis < 3; axis++) {
 		uint32_t cell = (uint32_t)s->mesh.position[v][axis] / LATTICE / BIN_CELLS;
 		at[axis] = cell < BINS_SIDE ? cell : BINS_SIDE - 1;
 	}
-	return (at[2] * BINS_SIDE + at[1]) * BINS_SIDE + at[0];
+	return (uint8_t)((at[2] * BINS_SIDE + at[1]) * BINS_SIDE + at[0]);
 }
 
-/* Sorts the triangles into the bins of their first corners, the bins by their vertices. */
+/* Those with most vertices first. */
+static void order_bins(struct bins *bins, const uint32_t count[BINS])
+{
+	bins->n = 0;
+	for (uint32_t b = 0; b < BINS; b++) {
+		if (count[b] < SEED_MIN)
+			continue;
+		uint32_t k = bins->n++;
+		for (; k && count[bins->order[k - 1]] < count[b]; k--)
+			bins->order[k] = bins->order[k - 1];
+		bins->order[k] = b;
+	}
+}
+
+/* Sorts the triangles into the bins of their first corners. */
 static int sort_bins(const struct grower *g, struct bins *bins)
 {
-	const struct simplify *s = g->s;
-	const struct halfedge_mesh *mesh = &s->mesh;
-	uint32_t fill[BINS];
+	const struct halfedge_mesh *mesh = &g->s->mesh;
+	uint32_t fill[BINS], count[BINS] = {0};
+	uint8_t *bin = ARENA_NEW(g->arena, uint8_t, mesh->nv);
 	*bins = (struct bins){.triangle = ARENA_NEW(g->arena, uint32_t, mesh->nt)};
-	if (!bins->triangle)
+	if (!bin || !bins->triangle)
 		return -ENOMEM;
-	for (uint32_t v = 0; v < mesh->nv; v++)
-		bins->count[bin_of(s, v)] += mesh->first[v] != HALFEDGE_NONE;
+	for (uint32_t v = 0; v < mesh->nv; v++) {
+		bin[v] = bin_of(g->s, v);
+		count[bin[v]] += mesh->first[v] != HALFEDGE_NONE;
+	}
 	for (uint32_t t = 0; t < mesh->nt; t++)
 		if (halfedge_alive(mesh, t))
-			bins->first[bin_of(s, mesh->origin[3 * t]) + 1]++;
+			bins->first[bin[mesh->origin[3 * t]] + 1]++;
 	for (uint32_t b = 0; b < BINS; b++)
 		fill[b] = bins->first[b + 1] += bins->first[b];
 	for (uint32_t t = mesh->nt; t-- > 0;)
 		if (halfedge_alive(mesh, t))
-			bins->triangle[--fill[bin_of(s, mesh->origin[3 * t])]] = t;
-	for (uint32_t b = 0; b < BINS; b++) {
-		uint32_t k = b;
-		for (; k && bins->count[bins->order[k - 1]] < bins->count[b]; k--)
-			bins->order[k] = bins->order[k - 1];
-		bins->order[k] = b;
-	}
+			bins->triangle[--fill[bin[mesh->origin[3 * t]]]] = t;
+	order_bins(bins, count);
 	return 0;
 }
 
@@ -472,7 +584,7 @@ static uint32_t first_free(const struct grower *g, const struct bins *bins, uint
 static int search_bin(struct grower *g, const struct bins *bins, uint32_t bin, uint32_t *number,
                       struct reduce_stats *stats)
 {
-	if (bins->count[bin] < SEED_MIN || free_vertices(g, bins, bin) < SEED_MIN)
+	if (free_vertices(g, bins, bin) < SEED_MIN)
 		return 0;
 	uint32_t seed = first_free(g, bins, bin);
 	if (fit(g, g->vertex, g->nv, seed) > SEED_SPREAD * g->slab * g->slab)
@@ -491,22 +603,28 @@ static int prepare(struct grower *g, struct simplify *s, struct arena *arena)
 {
 	const struct halfedge_mesh *mesh = &s->mesh;
 	*g = (struct grower){.s = s, .arena = arena, .slab = SLAB_SHARE * sqrt(s->tolerance_squared)};
+	g->place = ARENA_NEW(arena, struct vec3, mesh->nv);
 	g->normal = ARENA_NEW(arena, struct vec3, mesh->nt);
 	g->region = ARENA_NEW(arena, uint32_t, mesh->cap_nt);
 	g->taken = ARENA_NEW(arena, uint32_t, mesh->nt);
 	g->vertex = ARENA_NEW(arena, uint32_t, mesh->nv);
 	g->seen = ARENA_NEW(arena, uint32_t, mesh->nv);
+	g->projected = arena_alloc(arena, mesh->nv, sizeof *g->projected);
+	g->settled = ARENA_NEW(arena, bool, 3 * (size_t)mesh->nt);
 	g->point = ARENA_NEW(arena, struct vec3, mesh->nv);
 	s->region = ARENA_NEW(arena, struct region_plane, BINS);
-	if (!g->normal || !g->region || !g->taken || !g->vertex || !g->seen || !g->point || !s->region)
+	if (!g->place || !g->normal || !g->region || !g->taken || !g->vertex || !g->seen || !g->projected ||
+	    !g->settled || !g->point || !s->region)
 		return -ENOMEM;
 	memset(g->region, 0xff, mesh->cap_nt * sizeof *g->region);
+	for (uint32_t v = 0; v < mesh->nv; v++)
+		g->place[v] = simplify_place(s, v);
 	for (uint32_t t = 0; t < mesh->nt; t++) {
 		if (!halfedge_alive(mesh, t))
 			continue;
-		struct vec3 a = simplify_place(s, mesh->origin[3 * t]);
-		struct vec3 n = vec3_cross(vec3_sub(simplify_place(s, mesh->origin[3 * t + 1]), a),
-		                           vec3_sub(simplify_place(s, mesh->origin[3 * t + 2]), a));
+		const uint32_t *corner = &mesh->origin[3 * t];
+		struct vec3 a = g->place[corner[0]];
+		struct vec3 n = vec3_cross(vec3_sub(g->place[corner[1]], a), vec3_sub(g->place[corner[2]], a));
 		g->normal[t] = vec3_scale(n, 1 / vec3_norm(n));
 	}
 	return 0;
@@ -520,7 +638,7 @@ int region_flatten(struct simplify *s, struct arena *arena, struct reduce_stats 
 	int r = prepare(&g, s, arena);
 	if (!r)
 		r = sort_bins(&g, &bins);
-	for (uint32_t k = 0; k < BINS && !r; k++)
+	for (uint32_t k = 0; k < bins.n && !r; k++)
 		r = search_bin(&g, &bins, bins.order[k], &number, stats);
 	return r;
 }

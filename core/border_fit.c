@@ -41,8 +41,10 @@ static bool collapse_to(struct fit *fit, uint32_t v, uint32_t u, uint32_t other,
 	struct halfedge_mesh *mesh = fit->mesh;
 	uint32_t h = border_edge(mesh, v, u);
 	assert(h != HALFEDGE_NONE && mesh->twin[h] == HALFEDGE_NONE);
-	if (halfedge_valence(mesh, v) + halfedge_valence(mesh, u) > VALENCE_MAX || !halfedge_may_collapse(mesh, h, v) ||
-	    !guard_patch_faces(mesh, fit->border->faces, h, v, other) || !guard_shape(mesh, h, v, cosine))
+	struct halfedge_ring ring;
+	if (!halfedge_gather(mesh, v, &ring) || ring.n + halfedge_mark_ring(mesh, u) > VALENCE_MAX ||
+	    !halfedge_may_collapse(mesh, &ring, h) || !guard_patch_faces(mesh, fit->border->faces, &ring, u, other) ||
+	    !guard_shape(mesh, &ring, u, cosine))
 		return false;
 	halfedge_collapse(mesh, h, v);
 	return true;

@@ -6,63 +6,57 @@
  * 1/100 cell. */
 #include "core/guard.h"
 
-#include "core/predicates.h"
-
 #define ALTITUDE_MIN (0.01 * LATTICE)
 
-bool guard_patch_faces(struct halfedge_mesh *mesh, const uint8_t *faces, uint32_t h, uint32_t v, uint32_t allowed)
+bool guard_patch_faces(const struct halfedge_mesh *mesh, const uint8_t *faces, const struct halfedge_ring *ring,
+                       uint32_t u, uint32_t allowed)
 {
-	uint32_t u = halfedge_other(mesh, h, v);
 	if (!faces[u])
 		return true;
-	halfedge_mark_ring(mesh, u);
-	HALFEDGE_EACH(mesh, e, v)
-	{
-		uint32_t x = halfedge_target(mesh, e), y = mesh->origin[halfedge_previous(e)];
+	for (uint32_t k = 0; k < ring->n; k++) {
+		uint32_t x = ring->x[k], y = ring->y[k];
 		if (x != u && y != u && (faces[u] & faces[x] & faces[y]))
 			return false;
-		if (x != u && x != allowed && (faces[u] & faces[x]) && mesh->mark[x] != mesh->stamp)
+		if (x != u && x != allowed && (faces[u] & faces[x]) && !halfedge_marked(mesh, x))
 			return false;
-		if (y != u && y != allowed && (faces[u] & faces[y]) && mesh->mark[y] != mesh->stamp)
+		if (y != u && y != allowed && (faces[u] & faces[y]) && !halfedge_marked(mesh, y))
 			return false;
 	}
 	return true;
 }
 
-static double squared(const int64_t n[3])
+bool guard_normals(struct vec3 before, struct vec3 after, double longest_squared, double cosine)
 {
-	return (double)n[0] * (double)n[0] + (double)n[1] * (double)n[1] + (double)n[2] * (double)n[2];
-}
-
-static bool thick(const int64_t normal[3], const int32_t a[3], const int32_t b[3], const int32_t c[3])
-{
-	int64_t ab = distance_squared3(a, b), bc = distance_squared3(b, c), ca = distance_squared3(c, a);
-	int64_t longest = ab > bc ? ab : bc;
-	longest = longest > ca ? longest : ca;
-	return squared(normal) > ALTITUDE_MIN * ALTITUDE_MIN * (double)longest;
-}
-
-bool guard_turn(const int32_t v[3], const int32_t to[3], const int32_t b[3], const int32_t c[3], double cosine)
-{
-	int64_t before[3], after[3];
-	triangle_normal(v, b, c, before);
-	triangle_normal(to, b, c, after);
-	if (!thick(after, to, b, c))
+	double squared = vec3_dot(after, after), dot = vec3_dot(before, after);
+	if (squared <= ALTITUDE_MIN * ALTITUDE_MIN * longest_squared)
 		return false;
-	double dot = (double)before[0] * (double)after[0] + (double)before[1] * (double)after[1] +
-	             (double)before[2] * (double)after[2];
-	double bound = cosine * cosine * squared(before) * squared(after);
+	double bound = cosine * cosine * vec3_dot(before, before) * squared;
 	return cosine >= 0 ? dot > 0 && dot * dot > bound : dot >= 0 || dot * dot < bound;
 }
 
-bool guard_shape(const struct halfedge_mesh *mesh, uint32_t h, uint32_t v, double cosine)
+static struct vec3 between(const int32_t a[3], const int32_t b[3])
 {
-	uint32_t u = halfedge_other(mesh, h, v);
-	HALFEDGE_EACH(mesh, e, v)
-	{
-		uint32_t x = halfedge_target(mesh, e), y = mesh->origin[halfedge_previous(e)];
+	return (struct vec3){b[0] - a[0], b[1] - a[1], b[2] - a[2]};
+}
+
+/* Differences, normals and squared sides are whole numbers below 2^53: as doubles they are exact. */
+bool guard_turn(const int32_t v[3], const int32_t to[3], const int32_t b[3], const int32_t c[3], double cosine)
+{
+	struct vec3 bc = between(b, c), ab = between(to, b), ac = between(to, c);
+	double longest = vec3_dot(ab, ab), side = vec3_dot(ac, ac);
+	longest = longest > side ? longest : side;
+	side = vec3_dot(bc, bc);
+	longest = longest > side ? longest : side;
+	return guard_normals(vec3_cross(between(v, b), between(v, c)), vec3_cross(ab, ac), longest, cosine);
+}
+
+bool guard_shape(const struct halfedge_mesh *mesh, const struct halfedge_ring *ring, uint32_t u, double cosine)
+{
+	for (uint32_t k = 0; k < ring->n; k++) {
+		uint32_t x = ring->x[k], y = ring->y[k];
 		if (x != u && y != u &&
-		    !guard_turn(mesh->position[v], mesh->position[u], mesh->position[x], mesh->position[y], cosine))
+		    !guard_turn(mesh->position[ring->v], mesh->position[u], mesh->position[x], mesh->position[y],
+		                cosine))
 			return false;
 	}
 	return true;

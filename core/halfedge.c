@@ -145,29 +145,45 @@ int halfedge_build(const struct surface *surface, uint32_t spare, struct arena *
 	return 0;
 }
 
-void halfedge_mark_ring(struct halfedge_mesh *mesh, uint32_t v)
+uint32_t halfedge_mark_ring(struct halfedge_mesh *mesh, uint32_t v)
 {
-	mesh->stamp++;
+	uint32_t n = 0, stamp = ++mesh->stamp;
 	HALFEDGE_EACH(mesh, h, v)
 	{
-		mesh->mark[halfedge_target(mesh, h)] = mesh->stamp;
-		mesh->mark[mesh->origin[halfedge_previous(h)]] = mesh->stamp;
+		mesh->mark[halfedge_target(mesh, h)] = stamp;
+		mesh->mark[mesh->origin[halfedge_previous(h)]] = stamp;
+		n++;
 	}
+	return n;
 }
 
-/* Marked neighbours of v; takes their marks away, so that none counts twice. */
-static uint32_t count_marked(struct halfedge_mesh *mesh, uint32_t v)
+bool halfedge_gather(const struct halfedge_mesh *mesh, uint32_t v, struct halfedge_ring *ret)
 {
 	uint32_t n = 0;
+	ret->v = v;
+	ret->tail = HALFEDGE_NONE;
 	HALFEDGE_EACH(mesh, h, v)
 	{
-		uint32_t ring[2] = {halfedge_target(mesh, h), mesh->origin[halfedge_previous(h)]};
-		for (int k = 0; k < 2; k++)
-			if (mesh->mark[ring[k]] == mesh->stamp) {
-				mesh->mark[ring[k]] = 0;
-				n++;
-			}
+		if (n == HALFEDGE_RING_MAX)
+			return false;
+		uint32_t previous = halfedge_previous(h);
+		ret->h[n] = h;
+		ret->x[n] = halfedge_target(mesh, h);
+		ret->y[n] = mesh->origin[previous];
+		if (mesh->twin[previous] == HALFEDGE_NONE)
+			ret->tail = ret->y[n];
+		n++;
 	}
+	ret->n = n;
+	return true;
+}
+
+/* Marked neighbours. */
+static uint32_t count_marked(const struct halfedge_mesh *mesh, const struct halfedge_ring *ring)
+{
+	uint32_t n = ring->tail != HALFEDGE_NONE && halfedge_marked(mesh, ring->tail);
+	for (uint32_t k = 0; k < ring->n; k++)
+		n += halfedge_marked(mesh, ring->x[k]);
 	return n;
 }
 
@@ -177,24 +193,17 @@ static bool leaves_neighbour(const struct halfedge_mesh *mesh, uint32_t h)
 	return mesh->twin[halfedge_next(h)] != HALFEDGE_NONE || mesh->twin[halfedge_previous(h)] != HALFEDGE_NONE;
 }
 
-bool halfedge_may_collapse(struct halfedge_mesh *mesh, uint32_t h, uint32_t v)
+bool halfedge_may_collapse(const struct halfedge_mesh *mesh, const struct halfedge_ring *ring, uint32_t h)
 {
-	uint32_t u = halfedge_other(mesh, h, v), g = mesh->twin[h];
-	if (!leaves_neighbour(mesh, h) || (g != HALFEDGE_NONE && !leaves_neighbour(mesh, g)))
-		return false;
-	uint32_t valence = 0;
-	bool border = false;
-	HALFEDGE_EACH(mesh, e, v)
-	{
-		valence++;
-		border |= mesh->twin[e] == HALFEDGE_NONE;
-	}
+	uint32_t u = halfedge_other(mesh, h, ring->v), g = mesh->twin[h];
+	bool border = ring->tail != HALFEDGE_NONE;
 	if (border && g != HALFEDGE_NONE)
 		return false;
-	halfedge_mark_ring(mesh, u);
-	if (count_marked(mesh, v) != (g == HALFEDGE_NONE ? 1u : 2u))
+	if (count_marked(mesh, ring) != (g == HALFEDGE_NONE ? 1u : 2u))
 		return false;
-	if (border || valence != 3)
+	if (!leaves_neighbour(mesh, h) || (g != HALFEDGE_NONE && !leaves_neighbour(mesh, g)))
+		return false;
+	if (border || ring->n != 3)
 		return true;
 	/* The three triangles become one, which must not be there already. */
 	uint32_t x = mesh->origin[halfedge_previous(h)], y = mesh->origin[halfedge_previous(g)];
@@ -203,27 +212,30 @@ bool halfedge_may_collapse(struct halfedge_mesh *mesh, uint32_t h, uint32_t v)
 	       (f == HALFEDGE_NONE || mesh->origin[halfedge_previous(f)] != y);
 }
 
-static void drop(struct halfedge_mesh *mesh, uint32_t h)
+/* The triangle of h goes; its half-edge that leaves v stays in the list of v, which is about to go itself. */
+static void drop(struct halfedge_mesh *mesh, uint32_t h, uint32_t v)
 {
-	uint32_t triangle = h / 3;
-	join(mesh, mesh->twin[halfedge_next(h)], mesh->twin[halfedge_previous(h)]);
-	for (uint32_t e = 3 * triangle; e < 3 * triangle + 3; e++)
-		unlist(mesh, e);
-	for (uint32_t e = 3 * triangle; e < 3 * triangle + 3; e++)
-		mesh->origin[e] = mesh->twin[e] = HALFEDGE_NONE;
+	uint32_t edge[3] = {h, halfedge_next(h), halfedge_previous(h)};
+	join(mesh, mesh->twin[edge[1]], mesh->twin[edge[2]]);
+	for (int k = 0; k < 3; k++) {
+		if (mesh->origin[edge[k]] != v)
+			unlist(mesh, edge[k]);
+		mesh->origin[edge[k]] = mesh->twin[edge[k]] = HALFEDGE_NONE;
+	}
 }
 
 void halfedge_collapse(struct halfedge_mesh *mesh, uint32_t h, uint32_t v)
 {
 	uint32_t u = halfedge_other(mesh, h, v), g = mesh->twin[h];
-	drop(mesh, h);
+	drop(mesh, h, v);
 	if (g != HALFEDGE_NONE)
-		drop(mesh, g);
-	for (uint32_t e = mesh->first[v]; e != HALFEDGE_NONE;) {
-		uint32_t next = mesh->next_leaving[e];
+		drop(mesh, g, v);
+	for (uint32_t e = mesh->first[v], next; e != HALFEDGE_NONE; e = next) {
+		next = mesh->next_leaving[e];
+		if (mesh->origin[e] == HALFEDGE_NONE)
+			continue;
 		mesh->origin[e] = u;
 		enlist(mesh, e);
-		e = next;
 	}
 	mesh->first[v] = HALFEDGE_NONE;
 }

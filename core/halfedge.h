@@ -67,16 +67,32 @@ uint32_t halfedge_valence(const struct halfedge_mesh *mesh, uint32_t v); /* tria
 void halfedge_add(struct halfedge_mesh *mesh, uint32_t slot, uint32_t a, uint32_t b, uint32_t c);
 void halfedge_remove(struct halfedge_mesh *mesh, uint32_t triangle);
 
-/* Whether moving v, an end of h, into the other end keeps a surface: their common neighbours are just the tips of the
- * triangles at h, a border vertex moves along its border only, no triangle is left alone or doubled. v must not be a
- * touching vertex. */
-bool halfedge_may_collapse(struct halfedge_mesh *mesh, uint32_t h, uint32_t v);
+/* The triangles at vertex v, in the order of its list: half-edge h[k] runs from v to x[k], the third corner is y[k]. */
+#define HALFEDGE_RING_MAX 64
+struct halfedge_ring {
+	uint32_t v, n;
+	uint32_t tail; /* of a border vertex: the neighbour that is no x; or HALFEDGE_NONE */
+	uint32_t h[HALFEDGE_RING_MAX], x[HALFEDGE_RING_MAX], y[HALFEDGE_RING_MAX];
+};
+
+/* false where v has more than HALFEDGE_RING_MAX triangles. */
+bool halfedge_gather(const struct halfedge_mesh *mesh, uint32_t v, struct halfedge_ring *ret);
+
+/* Whether moving the vertex of `ring`, an end of h, into the other end keeps a surface: their common neighbours are just
+ * the tips of the triangles at h, a border vertex moves along its border only, no triangle is left alone or doubled. The
+ * neighbours of the other end must be marked; the vertex must not be a touching one. */
+bool halfedge_may_collapse(const struct halfedge_mesh *mesh, const struct halfedge_ring *ring, uint32_t h);
 
 /* Does it. Triangles keep their slots; those at h are removed. */
 void halfedge_collapse(struct halfedge_mesh *mesh, uint32_t h, uint32_t v);
 
-/* Gives the neighbours of v the mark mesh->stamp, fresh. */
-void halfedge_mark_ring(struct halfedge_mesh *mesh, uint32_t v);
+/* Gives the neighbours of v the mark mesh->stamp, fresh. Returns how many triangles v has. */
+uint32_t halfedge_mark_ring(struct halfedge_mesh *mesh, uint32_t v);
+
+static inline bool halfedge_marked(const struct halfedge_mesh *mesh, uint32_t v)
+{
+	return mesh->mark[v] == mesh->stamp;
+}
 
 /* NULL, or the first invariant that does not hold, as a sentence. For tests and asserts. */
 const char *halfedge_check(const struct halfedge_mesh *mesh);

@@ -13,7 +13,7 @@
 
 static int cell_of(double coordinate)
 {
-	int cell = (int)floor(coordinate / LATTICE);
+	int cell = (int)(coordinate / LATTICE); /* rounding up below zero ends at the same cell */
 	return cell < 0 ? 0 : cell >= SIDE ? SIDE - 1 : cell;
 }
 
@@ -44,17 +44,26 @@ static bool in_cell(const struct nearby *nearby, int cell, struct vec3 p)
 	return false;
 }
 
-bool nearby_has(const struct nearby *nearby, struct vec3 p)
+/* The cells from `low` to `high`, both among the cells of the patch. */
+static bool in_cells(const struct nearby *nearby, const int low[3], const int high[3], struct vec3 p)
 {
-	int at[3] = {cell_of(p.x), cell_of(p.y), cell_of(p.z)};
-	if (in_cell(nearby, (at[2] * SIDE + at[1]) * SIDE + at[0], p))
-		return true;
-	for (int z = at[2] ? at[2] - 1 : 0; z <= at[2] + 1 && z < SIDE; z++)
-		for (int y = at[1] ? at[1] - 1 : 0; y <= at[1] + 1 && y < SIDE; y++)
-			for (int x = at[0] ? at[0] - 1 : 0; x <= at[0] + 1 && x < SIDE; x++)
+	for (int z = low[2]; z <= high[2]; z++)
+		for (int y = low[1]; y <= high[1]; y++)
+			for (int x = low[0]; x <= high[0]; x++)
 				if (in_cell(nearby, (z * SIDE + y) * SIDE + x, p))
 					return true;
 	return false;
+}
+
+/* A vertex on an edge of the cell of p is listed there or in a cell above it: these answer nearly always. */
+bool nearby_has(const struct nearby *nearby, struct vec3 p)
+{
+	int at[3] = {cell_of(p.x), cell_of(p.y), cell_of(p.z)}, low[3], high[3];
+	for (int axis = 0; axis < 3; axis++) {
+		low[axis] = at[axis] ? at[axis] - 1 : 0;
+		high[axis] = at[axis] < SIDE - 1 ? at[axis] + 1 : at[axis];
+	}
+	return in_cells(nearby, at, high, p) || in_cells(nearby, low, high, p);
 }
 
 bool nearby_has_segment(const struct nearby *nearby, struct vec3 a, struct vec3 b)

@@ -1,8 +1,9 @@
 /* Half-edge collapses, cheapest first.
  *
- * A vertex waits in a heap under the cost of its best target; when its turn comes its targets are tried from the
+ * A vertex waits in a tournament under the cost of its best target; when its turn comes its targets are tried from the
  * cheapest on, and one that the guards or the exact test refuse hands the turn back under the cost of the next. A
- * collapse gives the vertices around it a new turn. Ties go to the smaller index: the order is total.
+ * collapse gives the vertices around it a new turn. Ties go to the smaller index: the order is total. (A heap would
+ * ask for a comparison nobody can foresee at each of its levels; a tournament asks for a minimum.)
  *
  * The cost of moving v into u is the mean squared distance of u to the planes both stand for, at most the tolerance
  * squared, plus a little of the length of the way, so that flat parts shrink evenly. The exact test of law L5 asks more:
@@ -23,7 +24,6 @@
 
 #define COSINE_TURN  0.30901699437494742 /* 72 degrees */
 #define VALENCE_MAX  24
-#define FLATS_MAX    32              /* triangles of a vertex that may go: with more, VALENCE_MAX refuses it */
 #define RIM_SIDEWAYS 0.5             /* cells */
 #define RIM_GAP      5               /* lattice units a rim vertex keeps from other rim edges, 0.02 cell */
 #define ERROR_SHARE  0.1             /* of the sum of squared distances, in the cost */
@@ -35,18 +35,26 @@ struct target {
 	uint32_t u, h;
 };
 
+/* What a cost reads of a vertex. */
+struct spot {
+	struct vec3 at;
+	double own;    /* its quadric at its own place */
+	double planes; /* weight of its quadric */
+};
+
 struct pass {
 	struct simplify *s;
-	uint32_t *heap, *place, n; /* place [nv] in the heap, or UINT32_MAX */
-	double *key;               /* [nv] */
-	double *own;               /* [nv] quadric at its own place */
-	struct target *best;       /* [nv] */
-	bool *stale;               /* [nv] `best` may have changed */
-	bool *on_rim;              /* [nv] */
-	uint8_t *tried;            /* [nv] targets refused since the last change around */
-	uint32_t *rim, rims;       /* vertices that were on a border at the start */
-	struct flat flat[FLATS_MAX];
-	uint32_t flat_triangle[FLATS_MAX], flats;
+	struct spot *spot;   /* [nv] */
+	double *key;         /* [2 leaves] tournament: key[leaves + v] of vertex v, below them the lesser of two */
+	uint32_t leaves;     /* a power of two, at least nv */
+	struct target *best; /* [nv] */
+	bool *stale;         /* [nv] `best` may have changed */
+	bool *on_rim;        /* [nv] */
+	bool *tried;         /* [nv] a cheaper target was refused since the last change around */
+	uint32_t *rim, rims; /* vertices that were on a border at the start */
+	struct halfedge_ring ring; /* of the vertex whose turn it is */
+	struct fan fan;            /* its triangles that stay, as they then lie */
+	uint32_t fan_triangle[FAN_MAX];
 	uint32_t *point, *point_triangle, points; /* where the exact test puts the points */
 };
 
@@ -103,147 +111,88 @@ void simplify_settle(struct simplify *s)
 	}
 }
 
-/* The heap of vertices, by key, then by index. */
-static bool earlier(const struct pass *pass, uint32_t v, uint32_t w)
+/* The tournament of vertices, by key, then by index. INFINITY: the vertex has no turn. */
+static void set_key(struct pass *pass, uint32_t v, double key)
 {
-	return pass->key[v] < pass->key[w] || (pass->key[v] == pass->key[w] && v < w);
-}
-
-static void put(struct pass *pass, uint32_t at, uint32_t v)
-{
-	pass->heap[at] = v;
-	pass->place[v] = at;
-}
-
-static void sift_up(struct pass *pass, uint32_t at, uint32_t v)
-{
-	while (at && earlier(pass, v, pass->heap[(at - 1) / 2])) {
-		put(pass, at, pass->heap[(at - 1) / 2]);
-		at = (at - 1) / 2;
+	double *at = pass->key;
+	uint32_t k = pass->leaves + v;
+	at[k] = key;
+	for (; k > 1; k /= 2) {
+		double other = at[k ^ 1];
+		key = key < other ? key : other;
+		at[k / 2] = key;
 	}
-	put(pass, at, v);
 }
 
-static void sift_down(struct pass *pass, uint32_t at, uint32_t v)
+static bool has_turn(const struct pass *pass, uint32_t v)
 {
-	for (;;) {
-		uint32_t child = 2 * at + 1;
-		if (child >= pass->n)
-			break;
-		if (child + 1 < pass->n && earlier(pass, pass->heap[child + 1], pass->heap[child]))
-			child++;
-		if (!earlier(pass, pass->heap[child], v))
-			break;
-		put(pass, at, pass->heap[child]);
-		at = child;
-	}
-	put(pass, at, v);
+	return pass->key[pass->leaves + v] < INFINITY;
 }
 
-static void heap_remove(struct pass *pass, uint32_t v)
+/* The vertex of the least key; HALFEDGE_NONE where nobody has a turn. */
+static uint32_t first_turn(const struct pass *pass)
 {
-	uint32_t at = pass->place[v];
-	if (at == UINT32_MAX)
-		return;
-	pass->place[v] = UINT32_MAX;
-	uint32_t last = pass->heap[--pass->n];
-	if (last == v)
-		return;
-	if (at && earlier(pass, last, pass->heap[(at - 1) / 2]))
-		sift_up(pass, at, last);
-	else
-		sift_down(pass, at, last);
-}
-
-static void heap_set(struct pass *pass, uint32_t v, double key)
-{
-	heap_remove(pass, v);
-	pass->key[v] = key;
-	sift_up(pass, pass->n++, v);
+	uint32_t k = 1;
+	if (pass->key[1] == INFINITY)
+		return HALFEDGE_NONE;
+	while (k < pass->leaves)
+		k = 2 * k + (pass->key[2 * k] != pass->key[1]);
+	return k - pass->leaves;
 }
 
 static void note_own(struct pass *pass, uint32_t u)
 {
-	const int32_t *p = pass->s->mesh.position[u];
-	const double at[3] = {p[0], p[1], p[2]};
-	pass->own[u] = quadric_at(&pass->s->quadric[u], at);
+	const struct quadric *quadric = &pass->s->quadric[u];
+	struct spot *spot = &pass->spot[u];
+	const double at[3] = {spot->at.x, spot->at.y, spot->at.z};
+	spot->own = quadric_at(quadric, at);
+	spot->planes = quadric->planes;
 }
 
-/* Cost of moving v into u, or a negative number where the mean quadric is beyond the tolerance. */
+/* Cost of moving v into u, or INFINITY where the mean quadric is beyond the tolerance. */
 static double cost_of(const struct pass *pass, uint32_t v, uint32_t u)
 {
-	const struct simplify *s = pass->s;
-	const int32_t *to = s->mesh.position[u];
-	const double at[3] = {to[0], to[1], to[2]};
-	double sum = quadric_at(&s->quadric[v], at) + pass->own[u];
-	if (sum > s->tolerance_squared * (s->quadric[v].planes + s->quadric[u].planes))
-		return -1;
-	double cost = ERROR_SHARE * sum + LENGTH_SHARE * (double)distance_squared3(s->mesh.position[v], to);
-	return cost > 0 ? cost : 0;
+	const struct spot *from = &pass->spot[v], *to = &pass->spot[u];
+	const double at[3] = {to->at.x, to->at.y, to->at.z};
+	double sum = quadric_at(&pass->s->quadric[v], at) + to->own;
+	struct vec3 way = vec3_sub(to->at, from->at);
+	double cost = ERROR_SHARE * sum + LENGTH_SHARE * vec3_dot(way, way);
+	cost = cost > 0 ? cost : 0;
+	return sum > pass->s->tolerance_squared * (from->planes + to->planes) ? INFINITY : cost;
 }
 
-static void look_at(const struct pass *pass, uint32_t v, uint32_t h, struct target *best)
+static void look_at(const struct pass *pass, uint32_t v, uint32_t h, const struct target *floor, struct target *best)
 {
 	uint32_t u = halfedge_other(&pass->s->mesh, h, v);
 	double cost = cost_of(pass, v, u);
-	if (cost >= 0 && (cost < best->cost || (cost == best->cost && u < best->u)))
+	if ((cost < best->cost || (cost == best->cost && u < best->u)) &&
+	    (cost > floor->cost || (cost == floor->cost && u > floor->u)))
 		*best = (struct target){cost, u, h};
 }
 
-/* The cheapest target of v; its u is HALFEDGE_NONE where there is none. */
-static struct target best_target(const struct pass *pass, uint32_t v)
+/* The cheapest target of v that comes after `floor`; its cost is INFINITY where there is none. */
+static struct target best_target(const struct pass *pass, uint32_t v, const struct target *floor)
 {
 	const struct halfedge_mesh *mesh = &pass->s->mesh;
-	struct target best = {INFINITY, HALFEDGE_NONE, HALFEDGE_NONE};
+	struct target best = {INFINITY, 0, HALFEDGE_NONE};
 	if (pass->on_rim[v]) {
-		look_at(pass, v, halfedge_border_from(mesh, v), &best);
-		look_at(pass, v, halfedge_border_into(mesh, v), &best);
+		look_at(pass, v, halfedge_border_from(mesh, v), floor, &best);
+		look_at(pass, v, halfedge_border_into(mesh, v), floor, &best);
 		return best;
 	}
 	HALFEDGE_EACH(mesh, h, v)
-	look_at(pass, v, h, &best);
+	look_at(pass, v, h, floor, &best);
 	return best;
-}
-
-static void add_target(const struct pass *pass, uint32_t v, uint32_t h, struct target *target, uint32_t *n)
-{
-	uint32_t u = halfedge_other(&pass->s->mesh, h, v);
-	double cost = cost_of(pass, v, u);
-	if (cost < 0 || *n == VALENCE_MAX)
-		return;
-	uint32_t k = (*n)++;
-	while (k && (target[k - 1].cost > cost || (target[k - 1].cost == cost && target[k - 1].u > u))) {
-		target[k] = target[k - 1];
-		k--;
-	}
-	target[k] = (struct target){cost, u, h};
-}
-
-/* Where v may go, cheapest first. */
-static uint32_t find_targets(const struct pass *pass, uint32_t v, struct target *target)
-{
-	const struct halfedge_mesh *mesh = &pass->s->mesh;
-	uint32_t n = 0;
-	if (pass->on_rim[v]) {
-		add_target(pass, v, halfedge_border_from(mesh, v), target, &n);
-		add_target(pass, v, halfedge_border_into(mesh, v), target, &n);
-		return n;
-	}
-	HALFEDGE_EACH(mesh, h, v)
-	add_target(pass, v, h, target, &n);
-	return n;
 }
 
 /* What v would cost, as of now. */
 static void give_turn(struct pass *pass, uint32_t v)
 {
-	pass->tried[v] = 0;
+	const struct target none = {-1, 0, HALFEDGE_NONE};
+	pass->tried[v] = false;
 	pass->stale[v] = false;
-	pass->best[v] = best_target(pass, v);
-	if (pass->best[v].u != HALFEDGE_NONE)
-		heap_set(pass, v, pass->best[v].cost);
-	else
-		heap_remove(pass, v);
+	pass->best[v] = best_target(pass, v, &none);
+	set_key(pass, v, pass->best[v].cost);
 }
 
 /* Something around v has changed. Costs hardly ever fall by that, so it is looked at when its turn comes; at once only
@@ -253,57 +202,70 @@ static void notice(struct pass *pass, uint32_t v)
 	if (pass->s->fixed[v])
 		return;
 	pass->stale[v] = true;
-	if (pass->place[v] == UINT32_MAX || pass->tried[v])
+	if (!has_turn(pass, v) || pass->tried[v])
 		give_turn(pass, v);
 }
 
-/* The triangles that stay when v moves into u, as they then lie; where none does, the one behind h's tip. */
-static void make_flats(struct pass *pass, uint32_t v, uint32_t u, uint32_t h)
+/* A triangle of the fan, its normal as long as twice the area. */
+static struct flat open_flat(const struct pass *pass, uint32_t a, uint32_t b, uint32_t c)
 {
-	const struct simplify *s = pass->s;
-	const struct halfedge_mesh *mesh = &s->mesh;
-	assert(halfedge_valence(mesh, v) <= FLATS_MAX);
-	pass->flats = 0;
-	HALFEDGE_EACH(mesh, e, v)
-	{
-		uint32_t x = halfedge_target(mesh, e), y = mesh->origin[halfedge_previous(e)];
-		if (x == u || y == u)
-			continue;
-		pass->flat_triangle[pass->flats] = e / 3;
-		pass->flat[pass->flats++] = flat_make(simplify_place(s, u), simplify_place(s, x), simplify_place(s, y));
-	}
-	if (pass->flats)
-		return;
-	uint32_t next = mesh->twin[halfedge_next(h)], previous = mesh->twin[halfedge_previous(h)];
-	uint32_t t = (next != HALFEDGE_NONE ? next : previous) / 3;
-	pass->flat_triangle[0] = t;
-	pass->flat[0] = flat_make(simplify_place(s, mesh->origin[3 * t]), simplify_place(s, mesh->origin[3 * t + 1]),
-	                          simplify_place(s, mesh->origin[3 * t + 2]));
-	pass->flats = 1;
+	struct flat flat = {.a = pass->spot[a].at};
+	flat.ab = vec3_sub(pass->spot[b].at, flat.a);
+	flat.ac = vec3_sub(pass->spot[c].at, flat.a);
+	flat.normal = vec3_cross(flat.ab, flat.ac);
+	flat.ab_ab = vec3_dot(flat.ab, flat.ab);
+	flat.ab_ac = vec3_dot(flat.ab, flat.ac);
+	flat.ac_ac = vec3_dot(flat.ac, flat.ac);
+	return flat;
 }
 
-static uint32_t nearest_flat(const struct pass *pass, struct vec3 p, double *ret_squared)
+/* Lays out the triangles that stay when v moves into u, as they then lie; false where one turns too far or gets thin. */
+static bool lay_fan(struct pass *pass, uint32_t u)
 {
-	uint32_t best = 0;
-	*ret_squared = INFINITY;
-	for (uint32_t f = 0; f < pass->flats; f++) {
-		double squared = flat_distance_squared(&pass->flat[f], p);
-		if (squared < *ret_squared) {
-			*ret_squared = squared;
-			best = f;
-		}
+	const struct halfedge_ring *ring = &pass->ring;
+	assert(ring->n <= FAN_MAX); /* with more, VALENCE_MAX refuses it */
+	struct vec3 back = vec3_sub(pass->spot[ring->v].at, pass->spot[u].at);
+	struct fan *fan = &pass->fan;
+	fan->n = 0;
+	for (uint32_t k = 0; k < ring->n; k++) {
+		if (ring->x[k] == u || ring->y[k] == u)
+			continue;
+		struct flat *flat = &fan->flat[fan->n];
+		*flat = open_flat(pass, u, ring->x[k], ring->y[k]);
+		double longest = flat->ab_ab > flat->ac_ac ? flat->ab_ab : flat->ac_ac;
+		double third = flat->ab_ab + flat->ac_ac - 2 * flat->ab_ac;
+		struct vec3 before = vec3_cross(vec3_sub(flat->ab, back), vec3_sub(flat->ac, back));
+		if (!guard_normals(before, flat->normal, longest > third ? longest : third, COSINE_TURN))
+			return false;
+		pass->fan_triangle[fan->n++] = ring->h[k] / 3;
 	}
-	return best;
+	return true;
+}
+
+/* The rest of what distances need. Where no triangle stays, the fan is the one behind the tip of h. */
+static void close_fan(struct pass *pass, uint32_t h)
+{
+	const struct halfedge_mesh *mesh = &pass->s->mesh;
+	struct fan *fan = &pass->fan;
+	if (!fan->n) {
+		uint32_t next = mesh->twin[halfedge_next(h)], previous = mesh->twin[halfedge_previous(h)];
+		uint32_t t = (next != HALFEDGE_NONE ? next : previous) / 3;
+		const uint32_t *corner = &mesh->origin[3 * t];
+		fan->flat[0] = open_flat(pass, corner[0], corner[1], corner[2]);
+		pass->fan_triangle[0] = t;
+		fan->n = 1;
+	}
+	fan_close(fan);
 }
 
 static bool place_point(struct pass *pass, uint32_t p)
 {
 	double squared;
-	uint32_t f = nearest_flat(pass, pass->s->origin[p], &squared);
+	uint32_t f = fan_nearest(&pass->fan, pass->s->origin[p], &squared);
 	if (squared > pass->s->tolerance_squared)
 		return false;
 	pass->point[pass->points] = p;
-	pass->point_triangle[pass->points++] = pass->flat_triangle[f];
+	pass->point_triangle[pass->points++] = pass->fan_triangle[f];
 	return true;
 }
 
@@ -312,23 +274,24 @@ static bool rim_point_near(const struct pass *pass, uint32_t p)
 {
 	double squared;
 	struct vec3 at = pass->s->origin[p];
-	const struct flat *flat = &pass->flat[nearest_flat(pass, at, &squared)];
+	const struct flat *flat = &pass->fan.flat[fan_nearest(&pass->fan, at, &squared)];
 	double height = vec3_dot(vec3_sub(at, flat->a), flat->normal);
 	return squared <= pass->s->rim_squared && height * height <= pass->s->tolerance_squared;
 }
 
-static bool points_stay_near(struct pass *pass, uint32_t v, bool rim)
+static bool points_stay_near(struct pass *pass, bool rim)
 {
 	const struct simplify *s = pass->s;
+	const struct halfedge_ring *ring = &pass->ring;
 	pass->points = 0;
-	if (!rim && !place_point(pass, v))
+	if (!rim && !place_point(pass, ring->v))
 		return false;
-	HALFEDGE_EACH(&s->mesh, h, v)
-	{
-		for (uint32_t p = s->points[h / 3]; p != UINT32_MAX; p = s->next_point[p])
+	for (uint32_t k = 0; k < ring->n; k++) {
+		uint32_t t = ring->h[k] / 3;
+		for (uint32_t p = s->points[t]; p != UINT32_MAX; p = s->next_point[p])
 			if (!place_point(pass, p))
 				return false;
-		for (uint32_t e = h / 3 * 3; e < h / 3 * 3 + 3; e++)
+		for (uint32_t e = 3 * t; e < 3 * t + 3; e++)
 			for (uint32_t p = s->rim_points[e]; p != UINT32_MAX; p = s->next_point[p])
 				if (!rim_point_near(pass, p))
 					return false;
@@ -412,8 +375,8 @@ static uint32_t take_rim(struct simplify *s, uint32_t v, uint32_t h, uint32_t ot
 static void leave_planes(const struct pass *pass, uint32_t u)
 {
 	const struct simplify *s = pass->s;
-	for (uint32_t f = 0; f < pass->flats; f++) {
-		uint32_t *number = &s->plane[pass->flat_triangle[f]];
+	for (uint32_t f = 0; f < pass->fan.n; f++) {
+		uint32_t *number = &s->plane[pass->fan_triangle[f]];
 		if (*number == UINT32_MAX)
 			continue;
 		const struct region_plane *plane = &s->region[*number];
@@ -433,8 +396,8 @@ static void commit(struct pass *pass, uint32_t v, uint32_t u, uint32_t h, bool r
 		w = halfedge_other(mesh, other, v);
 		list = take_rim(s, v, h, other);
 	}
-	HALFEDGE_EACH(mesh, e, v)
-	s->points[e / 3] = UINT32_MAX;
+	for (uint32_t k = 0; k < pass->ring.n; k++)
+		s->points[pass->ring.h[k] / 3] = UINT32_MAX;
 	for (uint32_t k = 0; k < pass->points; k++) {
 		uint32_t t = pass->point_triangle[k];
 		s->next_point[pass->point[k]] = s->points[t];
@@ -458,8 +421,8 @@ static void commit(struct pass *pass, uint32_t v, uint32_t u, uint32_t h, bool r
 static bool flats_stay_near(const struct pass *pass)
 {
 	const struct nearby *nearby = &pass->s->nearby;
-	for (uint32_t f = 0; f < pass->flats; f++) {
-		const struct flat *flat = &pass->flat[f];
+	for (uint32_t f = 0; f < pass->fan.n; f++) {
+		const struct flat *flat = &pass->fan.flat[f];
 		if (!nearby_has_segment(nearby, flat->a, vec3_add(flat->a, flat->ab)))
 			return false;
 		if (flat->ab_ab + flat->ac_ac - 2 * flat->ab_ac <= WIDE * WIDE)
@@ -477,15 +440,19 @@ static bool try_target(struct pass *pass, uint32_t v, const struct target *targe
 	struct halfedge_mesh *mesh = &s->mesh;
 	uint32_t u = target->u, h = target->h;
 	bool rim = mesh->twin[h] == HALFEDGE_NONE;
-	uint32_t to = halfedge_valence(mesh, u), after = halfedge_valence(mesh, v) + to - (rim ? 2 : 4);
-	if ((after > VALENCE_MAX && after > to) || !halfedge_may_collapse(mesh, h, v) ||
-	    !guard_patch_faces(mesh, s->border.faces, h, v, HALFEDGE_NONE) || !guard_shape(mesh, h, v, COSINE_TURN))
+	struct halfedge_ring *ring = &pass->ring;
+	uint32_t to = halfedge_mark_ring(mesh, u);
+	if (!halfedge_gather(mesh, v, ring))
 		return false;
-	make_flats(pass, v, u, h);
+	uint32_t after = ring->n + to - (rim ? 2 : 4);
+	if ((after > VALENCE_MAX && after > to) || !halfedge_may_collapse(mesh, ring, h) ||
+	    !guard_patch_faces(mesh, s->border.faces, ring, u, HALFEDGE_NONE) || !lay_fan(pass, u))
+		return false;
+	close_fan(pass, h);
 	if (rim && (!rim_stays_near(pass, v, u, h) ||
 	            !rim_clear(pass, halfedge_other(mesh, other_rim_edge(mesh, v, h), v), u, v)))
 		return false;
-	if (!points_stay_near(pass, v, rim) || !flats_stay_near(pass))
+	if (!points_stay_near(pass, rim) || !flats_stay_near(pass))
 		return false;
 	commit(pass, v, u, h, rim);
 	return true;
@@ -507,44 +474,40 @@ static void notice_around(struct pass *pass, uint32_t u)
 static void take_turn(struct pass *pass, uint32_t v)
 {
 	if (pass->stale[v]) {
-		double before = pass->key[v];
+		double before = pass->key[pass->leaves + v];
 		give_turn(pass, v);
-		if (pass->place[v] == UINT32_MAX || pass->key[v] > before)
+		if (pass->best[v].cost > before)
 			return;
 	}
-	uint32_t k = pass->tried[v];
 	struct target target = pass->best[v];
-	heap_remove(pass, v);
-	if (!try_target(pass, v, &target)) {
-		struct target all[VALENCE_MAX];
-		uint32_t n = find_targets(pass, v, all);
-		pass->tried[v] = (uint8_t)++k;
-		if (k < n) {
-			pass->best[v] = all[k];
-			heap_set(pass, v, all[k].cost);
-		}
+	if (try_target(pass, v, &target)) {
+		set_key(pass, v, INFINITY);
+		notice_around(pass, target.u);
 		return;
 	}
-	notice_around(pass, target.u);
+	pass->tried[v] = true;
+	pass->best[v] = best_target(pass, v, &target);
+	set_key(pass, v, pass->best[v].cost);
 }
 
 static int reserve(struct pass *pass, uint32_t nv, struct arena *arena)
 {
-	pass->heap = ARENA_NEW(arena, uint32_t, nv);
-	pass->place = ARENA_NEW(arena, uint32_t, nv);
-	pass->key = ARENA_NEW(arena, double, nv);
-	pass->own = ARENA_NEW(arena, double, nv);
+	for (pass->leaves = 1; pass->leaves < nv;)
+		pass->leaves *= 2;
+	pass->spot = ARENA_NEW(arena, struct spot, nv);
+	pass->key = ARENA_NEW(arena, double, 2 * (size_t)pass->leaves);
 	pass->best = ARENA_NEW(arena, struct target, nv);
 	pass->stale = ARENA_NEW(arena, bool, nv);
 	pass->on_rim = ARENA_NEW(arena, bool, nv);
-	pass->tried = ARENA_NEW(arena, uint8_t, nv);
+	pass->tried = ARENA_NEW(arena, bool, nv);
 	pass->rim = ARENA_NEW(arena, uint32_t, nv);
 	pass->point = ARENA_NEW(arena, uint32_t, nv);
 	pass->point_triangle = ARENA_NEW(arena, uint32_t, nv);
-	if (!pass->heap || !pass->place || !pass->key || !pass->own || !pass->best || !pass->stale || !pass->on_rim ||
-	    !pass->tried || !pass->rim || !pass->point || !pass->point_triangle)
+	if (!pass->spot || !pass->key || !pass->best || !pass->stale || !pass->on_rim || !pass->tried || !pass->rim ||
+	    !pass->point || !pass->point_triangle)
 		return -ENOMEM;
-	memset(pass->place, 0xff, nv * sizeof *pass->place);
+	for (uint32_t k = 0; k < 2 * pass->leaves; k++)
+		pass->key[k] = INFINITY;
 	return 0;
 }
 
@@ -562,6 +525,7 @@ int simplify_collapse(struct simplify *s, struct arena *arena)
 	for (uint32_t v = 0; v < nv; v++) {
 		if (s->mesh.first[v] == HALFEDGE_NONE)
 			continue;
+		pass->spot[v].at = simplify_place(s, v);
 		note_own(pass, v);
 		pass->on_rim[v] = halfedge_border_from(&s->mesh, v) != HALFEDGE_NONE;
 		if (pass->on_rim[v])
@@ -570,7 +534,7 @@ int simplify_collapse(struct simplify *s, struct arena *arena)
 	for (uint32_t v = 0; v < nv; v++)
 		if (s->mesh.first[v] != HALFEDGE_NONE && !s->fixed[v])
 			give_turn(pass, v);
-	while (pass->n)
-		take_turn(pass, pass->heap[0]);
+	for (uint32_t v; (v = first_turn(pass)) != HALFEDGE_NONE;)
+		take_turn(pass, v);
 	return 0;
 }

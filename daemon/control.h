@@ -66,7 +66,7 @@ struct control_status {
 		struct sweep_stats sweep;
 	} rows;
 	size_t patches, encoded_bytes, pinned_bytes;
-	uint64_t faces, faces_raw;
+	uint64_t faces, faces_raw, batches; /* sets of changed patches that were published */
 	struct grid_stats grid;
 	uint64_t memory_cap;
 	size_t rss_bytes;

@@ -22,6 +22,7 @@
 #include <string.h>
 
 #include "daemon/daemon_parts.h"
+#include "daemon/listener.h"
 #include "daemon/log.h"
 #include "daemon/notify.h"
 #include "daemon/wall_clock.h"
@@ -498,6 +499,18 @@ static void finish(struct daemon *d)
 	journal_destroy(d->journal);
 }
 
+/* A socket unit and a configuration that do not fit each other are told apart from a daemon that does not answer. */
+static void report_passed(const struct daemon *d)
+{
+	const int left = listener_passed() - server_passed(d->server) - web_passed(d->web);
+
+	if (left > 0)
+		log_line(LOG_WARNING,
+		         "systemd passed %d socket%s that neither listen.native nor listen.http names; nobody is "
+		         "served there",
+		         left, left == 1 ? "" : "s");
+}
+
 static void announce(struct daemon *d)
 {
 	const char *address;
@@ -506,6 +519,7 @@ static void announce(struct daemon *d)
 		log_line(LOG_INFO, "listens on %s", address);
 	if (web_address(d->web))
 		log_line(LOG_INFO, "listens on %s", web_address(d->web));
+	report_passed(d);
 	notify_ready();
 }
 

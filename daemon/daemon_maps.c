@@ -143,6 +143,7 @@ static int publish(struct daemon *d, const struct worker_result *result)
 		end_map(d);
 	else if (result->reset)
 		publisher_reset(d->publisher);
+	d->batches++;
 	d->grid = result->grid;
 	d->field = result->field;
 	return publisher_publish(d->publisher, result->step, result->patch, result->faces_raw, result->patches);

@@ -73,6 +73,7 @@ struct daemon {
 	uint64_t jumps_untold;
 	double latency_ms[LATENCIES];
 	uint64_t latencies;
+	uint64_t batches;
 	struct grid_stats grid;
 	struct field_stats field;
 	uint64_t decoded[RATE_SECONDS + 1][CONFIG_DEVICES_MAX], rows[RATE_SECONDS + 1]; /* rings, a column a second */

@@ -141,6 +141,7 @@ static void fill_status(struct daemon *d, struct control_client client[CLIENTS_S
 	s.patches = map.patches;
 	s.faces = map.faces;
 	s.faces_raw = map.faces_raw;
+	s.batches = d->batches;
 	s.encoded_bytes = map.bytes;
 	s.pinned_bytes = map.pinned;
 	s.grid = d->grid;

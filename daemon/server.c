@@ -755,22 +755,6 @@ static bool open_door(struct server *s, const char *text, char error[320])
 	return true;
 }
 
-/* A socket unit and a configuration that do not fit each other are told apart from a daemon that does not answer. */
-static void report_passed(struct server *s)
-{
-	int left = listener_passed();
-	char text[200];
-
-	for (int i = 0; i < s->doors; i++)
-		left -= s->door[i].listener.passed;
-	if (left <= 0)
-		return;
-	snprintf(text, sizeof(text),
-	         "systemd passed %d socket%s that listen.native does not name; nobody is served there", left,
-	         left == 1 ? "" : "s");
-	s->host.log(s->host.ctx, LOG_WARNING, text);
-}
-
 struct server *server_create(uv_loop_t *loop, const struct config *config, struct publisher *publisher,
                              const struct server_host *host, char error[320])
 {
@@ -795,10 +779,18 @@ struct server *server_create(uv_loop_t *loop, const struct config *config, struc
 			server_destroy(s);
 			return NULL;
 		}
-	report_passed(s);
 	open_doors(s);
 	uv_timer_start(&s->timer, on_timer, TICK_MS, TICK_MS);
 	return s;
+}
+
+int server_passed(const struct server *s)
+{
+	int n = 0;
+
+	for (int i = 0; i < s->doors; i++)
+		n += s->door[i].listener.passed;
+	return n;
 }
 
 void server_stop(struct server *s)

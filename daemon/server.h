@@ -45,6 +45,9 @@ void server_event(struct server *, const char *text, size_t len); /* one JSON te
 /* Where listener `i` listens, e.g. for a port the system chose; NULL beyond the last. */
 const char *server_address(const struct server *, int i);
 
+/* How many of its sockets systemd had opened. */
+int server_passed(const struct server *);
+
 /* Fills at most `cap` clients; how many there are. */
 size_t server_clients(const struct server *, struct control_client *ret, size_t cap);
 

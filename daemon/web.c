@@ -765,6 +765,11 @@ const char *web_address(const struct web *web)
 	return web ? web->address : NULL;
 }
 
+bool web_passed(const struct web *web)
+{
+	return web && web->listener.passed;
+}
+
 bool web_loopback(const struct web *web)
 {
 	return !web || web->site.loopback;

@@ -83,6 +83,7 @@ void web_event(struct web *, const char *text, size_t len);                     
 size_t web_clients(const struct web *, struct control_client *ret, size_t cap); /* at most `cap`; how many there are */
 const char *web_address(const struct web *);                                    /* e.g. http://127.0.0.1:7880/ */
 bool web_loopback(const struct web *);
+bool web_passed(const struct web *); /* systemd had opened its socket */
 
 /* For languages. */
 void web_wake_one(struct web_connection *); /* `next` has something, or soon may */

@@ -5,6 +5,7 @@
 #include <math.h>
 #include <stdarg.h>
 #include <stdio.h>
+#include <string.h>
 
 static void family(struct buffer *b, const char *name, const char *type, const char *help)
 {
@@ -16,7 +17,7 @@ static void number(struct buffer *b, double value)
 	if (isfinite(value))
 		buffer_printf(b, " %.15g\n", value);
 	else
-		buffer_printf(b, " NaN\n");
+		buffer_printf(b, isnan(value) ? " NaN\n" : " +Inf\n");
 }
 
 /* One without labels. */
@@ -101,6 +102,7 @@ static void put_rows(struct buffer *b, const struct control_status *s)
 
 static void put_map(struct buffer *b, const struct control_status *s)
 {
+	counter(b, "batches_total", "Sets of changed patches that were published.", s->batches);
 	gauge(b, "blocks", "Blocks of voxels.", (double)s->grid.blocks);
 	gauge(b, "patches", "Patches with triangles.", (double)s->patches);
 	family(b, "triangles", "gauge", "Triangles of the map, before and after the reduction.");
@@ -245,12 +247,52 @@ static void put_publisher(struct buffer *b, const struct publisher_stats *p)
 		sample(b, "encodes_total", "form", form[i], (double)p->encodes[i]);
 }
 
+static void put_recording(struct buffer *b, const struct control_status *s)
+{
+	const struct recorder_status *r = &s->record;
+	const char *state = r->recording ? "recording" : r->enabled ? "waiting" : "off";
+	static const char *const states[] = {"off", "waiting", "recording"};
+
+	family(b, "recording", "gauge",
+	       "State of the recording of the folder; waiting: it is wanted, and cannot be written now.");
+	for (size_t i = 0; i < sizeof(states) / sizeof(states[0]); i++)
+		sample(b, "recording", "state", states[i], strcmp(states[i], state) == 0);
+	gauge(b, "recording_file_bytes", "Of the newest file.", (double)r->bytes);
+	gauge(b, "recording_file_messages", "In the newest file.", (double)r->messages);
+	counter(b, "recording_files_total", "Files begun.", r->files);
+	counter(b, "recording_gaps_total", "Times that something is missing between two files.", r->gaps);
+	counter(b, "recording_dropped_total", "Events that found no room, or no file.", r->dropped);
+	gauge(b, "recording_queued_bytes", "What waits for the disk.", (double)r->queued);
+	gauge(b, "recording_queued_bytes_peak", "The most that ever waited.", (double)r->queued_peak);
+	gauge(b, "recording_streams", "Recordings that clients take.", (double)s->streams);
+}
+
+/* Only there while something is replayed. */
+static void put_replay(struct buffer *b, const struct control_status *s)
+{
+	const struct player_status *p = &s->replay;
+
+	if (!s->replays)
+		return;
+	family(b, "replay", "gauge", "State of the replay.");
+	for (int i = PLAYER_PLAYING; i <= PLAYER_ENDED; i++)
+		sample(b, "replay", "state", player_state_name((enum player_state)i), (int)p->state == i);
+	gauge(b, "replay_position_seconds", "Recorded time gone through.", (double)(p->now_ns - p->begin_ns) / 1e9);
+	gauge(b, "replay_length_seconds", "Recorded time there is.", (double)(p->end_ns - p->begin_ns) / 1e9);
+	gauge(b, "replay_speed_ratio", "Recorded seconds a second that are wanted; +Inf: as many as can be.",
+	      p->speed == 0 ? (double)INFINITY : p->speed);
+	counter(b, "replay_seeks_total", "Jumps to another place of the recording.", p->seeks);
+	gauge(b, "replay_failed", "Whether it ended early because something was wrong.", *s->replay_error != '\0');
+}
+
 void web_metrics_put(struct buffer *b, const struct control_status *s, const struct publisher_stats *p)
 {
 	put_daemon(b, s);
 	put_rows(b, s);
 	put_map(b, s);
 	put_devices(b, s);
+	put_recording(b, s);
+	put_replay(b, s);
 	put_clients(b, s);
 	put_publisher(b, p);
 }

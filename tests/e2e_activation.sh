@@ -29,11 +29,11 @@ def tcp_socket(host):
     return s
 
 
-def start(natives, sockets, log):
+def start(natives, sockets, log, http=""):
     config = scratch + "/facetd.yaml"
     open(log, "w").close()
     with open(config, "w") as file:
-        json.dump({"listen": {"native": natives}}, file)
+        json.dump({"listen": {"native": natives, "http": http}}, file)
     pid = os.fork()
     if pid == 0:
         out = os.open(log, os.O_WRONLY | os.O_CREAT | os.O_TRUNC)
@@ -44,7 +44,7 @@ def start(natives, sockets, log):
         os.environ.update(LISTEN_FDS=str(len(sockets)), LISTEN_PID=str(os.getpid()))
         os.execv(build + "/facetd", ["facetd", "--config", config])
     until = time.time() + 20
-    while time.time() < until and open(log).read().count("listens on") < len(natives):
+    while time.time() < until and open(log).read().count("listens on") < len(natives) + bool(http):
         time.sleep(0.05)
     return pid
 
@@ -104,10 +104,27 @@ except TimeoutError:
     pass
 end(pid)
 log = open(scratch + "/log").read()
-assert "systemd passed 3 sockets that listen.native does not name" in log, log
+assert "systemd passed 3 sockets that neither listen.native nor listen.http names" in log, log
 everywhere.close()
 pid = start([f"tcp:127.0.0.1:{port}"], [other], scratch + "/log")
 ask(socket.AF_INET, ("127.0.0.1", port))
 end(pid)
 assert "systemd passed 1 socket that" in open(scratch + "/log").read()
+
+# The socket of the page, passed like the others.
+page = tcp_socket("127.0.0.1")
+at = "127.0.0.1:%d" % page.getsockname()[1]
+waits = socket.create_connection(page.getsockname())
+waits.sendall(b"GET /status.json HTTP/1.1\r\nHost: " + at.encode() + b"\r\n\r\n")
+for _ in range(2):
+    pid = start(["unix:" + path], [door, page], scratch + "/log", http=at)
+    if "this build has no HTTP" in open(scratch + "/log").read():
+        break
+    waits = waits or socket.create_connection(page.getsockname())
+    waits.settimeout(20)
+    waits.sendall(b"GET /status.json HTTP/1.1\r\nHost: " + at.encode() + b"\r\n\r\n")
+    assert waits.recv(12) == b"HTTP/1.1 200", "the page's socket is not served"
+    waits = None
+    end(pid)
+    assert "systemd passed" not in open(scratch + "/log").read(), open(scratch + "/log").read()
 END

@@ -182,8 +182,15 @@ def metrics_are_prometheus_text_and_say_what_status_says(d):
     for reason in status["rows"]["dropped"]:
         check(f'facetd_rows_dropped_total{{reason="{reason}"}}' in values, f"rows dropped: {reason}")
     for name in ('facetd_latency_seconds{quantile="0.99"}', 'facetd_triangles{mesh="raw"}', 'facetd_triangles{mesh="reduced"}',
-                 "facetd_patches", "facetd_clients", 'facetd_encodes_total{form="native"}', "facetd_rows_applied_total"):
+                 "facetd_patches", "facetd_clients", "facetd_batches_total", "facetd_recording_queued_bytes", 'facetd_encodes_total{form="native"}', "facetd_rows_applied_total"):
         check(name in values, f"/metrics has no {name}")
+    record = status["record"]
+    state = "recording" if record["recording"] else "waiting" if record["enabled"] else "off"
+    for name in "off", "waiting", "recording":
+        check(values[f'facetd_recording{{state="{name}"}}'] == (name == state), f"the recording is {state}")
+    for name, member in ("file_bytes", "bytes"), ("files_total", "files"), ("dropped_total", "dropped"), ("gaps_total", "gaps"):
+        check(values[f"facetd_recording_{name}"] >= record[member], f"recording_{name} is behind the status")
+    check(not any(name.startswith("facetd_replay") for name in values), "figures of a replay where nothing is replayed")
 
 
 # ---- the map ----
@@ -262,9 +269,12 @@ def a_limited_rate_is_kept(d):
     ws.want(bytes_per_s=100000)
     total = 0
     while total < 150000:
-        total += len(ws.message()[1])
-        if mirror.commits:
+        data = ws.message()[1]
+        total += len(data)
+        mirror.feed(data)
+        if mirror.commits: # a small map
             break
+    check(total > 40000, f"a map of {total} bytes proves nothing")
     seconds = time.monotonic() - begin
     check(seconds > 0.8 * (total - 30000) / 100000, f"{total} bytes in {seconds:.2f} s at 100000 a second")
     ws.close()

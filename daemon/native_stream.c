@@ -261,9 +261,11 @@ void publisher_wrote(struct publisher_client *client, size_t n, int64_t t_ns)
 	}
 }
 
-bool publisher_at_end_of_frame(const struct publisher_client *client)
+bool publisher_ends_frame(const struct publisher_client *client, size_t n)
 {
-	return pending(client->stream) == 0;
+	const struct native_stream *stream = client->stream;
+
+	return n == stream->out_len - stream->out_at && pending(stream) == 0;
 }
 
 int64_t publisher_deadline(const struct publisher_client *client)

@@ -134,8 +134,8 @@ int publisher_walk_commit(struct publisher_client *);
 /* What is to be written next, borrowed until publisher_wrote or publisher_leave; 0: nothing now. */
 size_t publisher_peek(struct publisher_client *, int64_t t_ns, const uint8_t **ret);
 void publisher_wrote(struct publisher_client *, size_t n, int64_t t_ns);
-/* What publisher_peek gave last ends with the end of a frame. */
-bool publisher_at_end_of_frame(const struct publisher_client *);
+/* The first `n` bytes that publisher_peek gave end with the end of a frame. */
+bool publisher_ends_frame(const struct publisher_client *, size_t n);
 /* When to ask again, for one that wanted a limited rate; INT64_MAX: when something was published or written. */
 int64_t publisher_deadline(const struct publisher_client *);
 

@@ -125,7 +125,7 @@ static size_t next_frames(struct speech *s, uint8_t *buf, size_t cap, int64_t t_
 	if (n == 0)
 		return 0;
 	memcpy(buf, bytes, taken);
-	*ret = (struct web_piece){.final = taken == n && publisher_at_end_of_frame(s->client)};
+	*ret = (struct web_piece){.final = publisher_ends_frame(s->client, taken)};
 	s->frame_begun = !ret->final;
 	publisher_wrote(s->client, taken, t_ns);
 	return taken;

@@ -498,6 +498,42 @@ static void a_client_that_wants_a_rate_gets_no_more(void **state)
 	publisher_destroy(p);
 }
 
+/* The rate cuts what is written anywhere. What is said to end a frame does, and nothing else. */
+static void a_limited_rate_does_not_hide_where_frames_end(void **state)
+{
+	static struct history h;
+	struct publisher *p = start(&h, 200, 0);
+	struct native_want want = {.bytes_per_s = 20000};
+	struct publisher_client *client;
+	struct buffer got = {0};
+	const uint8_t *bytes;
+	int64_t t_ns = 1000000000;
+	size_t n, at = 0, ends = 0, cuts = 0;
+
+	(void)state;
+	random_state = 3;
+	advance_history(&h, p, KEYS);
+	client = publisher_join(p, &want);
+	for (int i = 0; i < 5000 && ends < 2; i++, t_ns = publisher_deadline(client))
+		while ((n = publisher_peek(client, t_ns, &bytes)) > 0) {
+			const bool whole = publisher_ends_frame(client, n);
+			ssize_t frame = 0;
+
+			buffer_append(&got, bytes, n);
+			while (at < got.len &&
+			       (frame = native_scan(got.data + at, got.len - at, NATIVE_TO_CLIENT_MAX)) > 0)
+				at += (size_t)frame;
+			assert_int_equal(whole, at == got.len);
+			ends += whole;
+			cuts += !whole;
+			publisher_wrote(client, n, t_ns);
+		}
+	assert_true(ends > 0 && cuts > 0);
+	buffer_finish(&got);
+	publisher_leave(client);
+	publisher_destroy(p);
+}
+
 static void nothing_but_the_reason_of_a_refusal_comes_before_hello(void **state)
 {
 	static struct history h;
@@ -545,6 +581,7 @@ int main(void)
 	    cmocka_unit_test(the_counts_of_faces_and_patches_follow_the_map),
 	    cmocka_unit_test(messages_come_between_frames_and_are_bounded),
 	    cmocka_unit_test(a_client_that_wants_a_rate_gets_no_more),
+	    cmocka_unit_test(a_limited_rate_does_not_hide_where_frames_end),
 	    cmocka_unit_test(nothing_but_the_reason_of_a_refusal_comes_before_hello),
 	};
 

@@ -6,8 +6,6 @@
  * 1/100 cell. */
 #include "core/guard.h"
 
-#define ALTITUDE_MIN (0.01 * LATTICE)
-
 bool guard_patch_faces(const struct halfedge_mesh *mesh, const uint8_t *faces, const struct halfedge_ring *ring,
                        uint32_t u, uint32_t allowed)
 {
@@ -23,15 +21,6 @@ bool guard_patch_faces(const struct halfedge_mesh *mesh, const uint8_t *faces, c
 			return false;
 	}
 	return true;
-}
-
-bool guard_normals(struct vec3 before, struct vec3 after, double longest_squared, double cosine)
-{
-	double squared = vec3_dot(after, after), dot = vec3_dot(before, after);
-	if (squared <= ALTITUDE_MIN * ALTITUDE_MIN * longest_squared)
-		return false;
-	double bound = cosine * cosine * vec3_dot(before, before) * squared;
-	return cosine >= 0 ? dot > 0 && dot * dot > bound : dot >= 0 || dot * dot < bound;
 }
 
 static struct vec3 between(const int32_t a[3], const int32_t b[3])

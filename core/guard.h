@@ -17,7 +17,16 @@ bool guard_shape(const struct halfedge_mesh *mesh, const struct halfedge_ring *r
 /* Whether the triangle v, b, c turns by less than the angle of cosine `cosine` and does not get thin when v goes to `to`. */
 bool guard_turn(const int32_t v[3], const int32_t to[3], const int32_t b[3], const int32_t c[3], double cosine);
 
+#define GUARD_ALTITUDE_MIN (0.01 * LATTICE) /* of a triangle, lattice units */
+
 /* The same of its normals (as long as twice the area) and the square of its longest side afterwards. */
-bool guard_normals(struct vec3 before, struct vec3 after, double longest_squared, double cosine);
+static inline bool guard_normals(struct vec3 before, struct vec3 after, double longest_squared, double cosine)
+{
+	double squared = vec3_dot(after, after), dot = vec3_dot(before, after);
+	if (squared <= GUARD_ALTITUDE_MIN * GUARD_ALTITUDE_MIN * longest_squared)
+		return false;
+	double bound = cosine * cosine * vec3_dot(before, before) * squared;
+	return cosine >= 0 ? dot > 0 && dot * dot > bound : dot >= 0 || dot * dot < bound;
+}
 
 #endif

@@ -30,8 +30,8 @@ int contour_find(const struct halfedge_mesh *mesh, const uint32_t *triangle, uin
 {
 	const struct walker walker = {mesh, region, number};
 	struct contour contour = {0};
-	contour.vertex = ARENA_NEW(arena, uint32_t, 3 * (size_t)n);
-	contour.loop_end = ARENA_NEW(arena, uint32_t, (size_t)n + 1);
+	contour.vertex = ARENA_TAKE(arena, uint32_t, 3 * (size_t)n);
+	contour.loop_end = ARENA_TAKE(arena, uint32_t, (size_t)n + 1);
 	bool *seen = ARENA_NEW(arena, bool, 3 * (size_t)mesh->nt);
 	if (!contour.vertex || !contour.loop_end || !seen)
 		return -ENOMEM;

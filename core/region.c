@@ -263,8 +263,8 @@ static bool order_loops(struct outline *outline, struct arena *arena)
 		return false;
 	if (outer == 0)
 		return true;
-	sorted.vertex = ARENA_NEW(arena, uint32_t, c->n);
-	sorted.loop_end = ARENA_NEW(arena, uint32_t, c->loops);
+	sorted.vertex = ARENA_TAKE(arena, uint32_t, c->n);
+	sorted.loop_end = ARENA_TAKE(arena, uint32_t, c->loops);
 	if (!sorted.vertex || !sorted.loop_end)
 		return false;
 	sorted.n = 0;
@@ -338,17 +338,16 @@ struct cover {
 	struct flat flat;
 };
 
-static struct cover cover_make(const struct grower *g, uint32_t t)
+static void cover_make(const struct grower *g, uint32_t t, struct cover *ret)
 {
-	struct cover cover = {.made = false};
 	const uint32_t *corner = &g->s->mesh.origin[3 * t];
 	for (int k = 0; k < 3; k++) {
 		const int32_t *a = g->projected[corner[k]], *b = g->projected[corner[(k + 1) % 3]];
-		cover.edge[k][0] = a[1] - b[1];
-		cover.edge[k][1] = b[0] - a[0];
-		cover.edge[k][2] = a[0] * b[1] - a[1] * b[0];
+		ret->edge[k][0] = a[1] - b[1];
+		ret->edge[k][1] = b[0] - a[0];
+		ret->edge[k][2] = a[0] * b[1] - a[1] * b[0];
 	}
-	return cover;
+	ret->made = false;
 }
 
 /* Sides are taken together: which one refuses is a coin's toss that no processor foresees. */
@@ -384,11 +383,11 @@ static bool hand_over(struct grower *g, uint32_t v, struct cover *cover, uint32_
 /* The vertices that went, in the triangles that came: the first `n` slots. 0, -EDOM or -ENOMEM. */
 static int hand_over_all(struct grower *g, uint32_t n)
 {
-	struct cover *cover = ARENA_NEW(g->arena, struct cover, n);
+	struct cover *cover = ARENA_TAKE(g->arena, struct cover, n);
 	if (!cover)
 		return -ENOMEM;
 	for (uint32_t k = 0; k < n; k++)
-		cover[k] = cover_make(g, g->taken[k]);
+		cover_make(g, g->taken[k], &cover[k]);
 	for (uint32_t k = 0; k < g->nv; k++)
 		if (g->s->mesh.first[g->vertex[k]] == HALFEDGE_NONE && !hand_over(g, g->vertex[k], cover, n))
 			return -EDOM;
@@ -449,8 +448,8 @@ static int flatten(struct grower *g, uint32_t number)
 	if (r)
 		return r;
 	project_vertices(g);
-	outline.point = arena_alloc(g->arena, outline.contour.n, sizeof *outline.point);
-	uint32_t(*before)[3] = arena_alloc(g->arena, g->n, sizeof *before), (*triangle)[3], n;
+	outline.point = arena_take(g->arena, outline.contour.n, sizeof *outline.point);
+	uint32_t(*before)[3] = arena_take(g->arena, g->n, sizeof *before), (*triangle)[3], n;
 	if (!outline.point || !before)
 		return -ENOMEM;
 	place_outline(&outline);
@@ -536,8 +535,8 @@ static int sort_bins(const struct grower *g, struct bins *bins)
 {
 	const struct halfedge_mesh *mesh = &g->s->mesh;
 	uint32_t fill[BINS], count[BINS] = {0};
-	uint8_t *bin = ARENA_NEW(g->arena, uint8_t, mesh->nv);
-	*bins = (struct bins){.triangle = ARENA_NEW(g->arena, uint32_t, mesh->nt)};
+	uint8_t *bin = ARENA_TAKE(g->arena, uint8_t, mesh->nv);
+	*bins = (struct bins){.triangle = ARENA_TAKE(g->arena, uint32_t, mesh->nt)};
 	if (!bin || !bins->triangle)
 		return -ENOMEM;
 	for (uint32_t v = 0; v < mesh->nv; v++) {
@@ -603,16 +602,16 @@ static int prepare(struct grower *g, struct simplify *s, struct arena *arena)
 {
 	const struct halfedge_mesh *mesh = &s->mesh;
 	*g = (struct grower){.s = s, .arena = arena, .slab = SLAB_SHARE * sqrt(s->tolerance_squared)};
-	g->place = ARENA_NEW(arena, struct vec3, mesh->nv);
-	g->normal = ARENA_NEW(arena, struct vec3, mesh->nt);
-	g->region = ARENA_NEW(arena, uint32_t, mesh->cap_nt);
-	g->taken = ARENA_NEW(arena, uint32_t, mesh->nt);
-	g->vertex = ARENA_NEW(arena, uint32_t, mesh->nv);
+	g->place = ARENA_TAKE(arena, struct vec3, mesh->nv);
+	g->normal = ARENA_TAKE(arena, struct vec3, mesh->nt);
+	g->region = ARENA_TAKE(arena, uint32_t, mesh->cap_nt);
+	g->taken = ARENA_TAKE(arena, uint32_t, mesh->nt);
+	g->vertex = ARENA_TAKE(arena, uint32_t, mesh->nv);
 	g->seen = ARENA_NEW(arena, uint32_t, mesh->nv);
-	g->projected = arena_alloc(arena, mesh->nv, sizeof *g->projected);
+	g->projected = arena_take(arena, mesh->nv, sizeof *g->projected);
 	g->settled = ARENA_NEW(arena, bool, 3 * (size_t)mesh->nt);
-	g->point = ARENA_NEW(arena, struct vec3, mesh->nv);
-	s->region = ARENA_NEW(arena, struct region_plane, BINS);
+	g->point = ARENA_TAKE(arena, struct vec3, mesh->nv);
+	s->region = ARENA_TAKE(arena, struct region_plane, BINS);
 	if (!g->place || !g->normal || !g->region || !g->taken || !g->vertex || !g->seen || !g->projected ||
 	    !g->settled || !g->point || !s->region)
 		return -ENOMEM;

@@ -227,7 +227,7 @@ static bool left_of(const int32_t a[2], const int32_t b[2])
 static int join_holes(const struct polygon *polygon, struct ring *ring, struct arena *arena)
 {
 	uint32_t holes = polygon->loops - 1;
-	uint32_t *hole = ARENA_NEW(arena, uint32_t, holes + 1);
+	uint32_t *hole = ARENA_TAKE(arena, uint32_t, holes + 1);
 	if (!hole)
 		return -ENOMEM;
 	for (uint32_t l = 1; l < polygon->loops; l++) {
@@ -282,7 +282,7 @@ static int fill_buckets(struct ring *ring, struct arena *arena)
 	while (most >> shift >= sides)
 		shift++;
 	ring->columns = (uint32_t)(most >> shift) + 1;
-	ring->bucket = ARENA_NEW(arena, uint32_t, ring->columns * ring->columns);
+	ring->bucket = ARENA_TAKE(arena, uint32_t, ring->columns * ring->columns);
 	if (!ring->bucket)
 		return -ENOMEM;
 	memset(ring->bucket, 0xff, ring->columns * ring->columns * sizeof *ring->bucket);
@@ -395,8 +395,8 @@ int triangulate(const struct polygon *polygon, triangulate_allows *allows, const
 	uint32_t places = polygon->n + 2 * (polygon->loops - 1);
 	if (polygon->n < 3)
 		return -EDOM;
-	ring.place = ARENA_NEW(arena, struct place, places);
-	uint32_t(*triangle)[3] = arena_alloc(arena, places, sizeof *triangle);
+	ring.place = ARENA_TAKE(arena, struct place, places);
+	uint32_t(*triangle)[3] = arena_take(arena, places, sizeof *triangle);
 	if (!ring.place || !triangle)
 		return -ENOMEM;
 	lay_loops(polygon, &ring);

@@ -108,6 +108,26 @@ void halfedge_remove(struct halfedge_mesh *mesh, uint32_t triangle)
 		mesh->origin[h] = mesh->twin[h] = HALFEDGE_NONE;
 }
 
+void halfedge_flip(struct halfedge_mesh *mesh, uint32_t h)
+{
+	uint32_t g = mesh->twin[h], h_next = halfedge_next(h), h_last = halfedge_previous(h);
+	assert(g != HALFEDGE_NONE);
+	uint32_t g_next = halfedge_next(g), g_last = halfedge_previous(g), first = h - h % 3, second = g - g % 3;
+	uint32_t tip = mesh->origin[h_last], far = mesh->origin[g_last];
+	const uint32_t was[6] = {h, h_next, h_last, g, g_next, g_last};
+	const uint32_t is[6] = {first, first + 1, first + 2, second, second + 1, second + 2};
+	const uint32_t corner[6] = {tip, mesh->origin[h], far, far, mesh->origin[g], tip};
+	const uint32_t twin[6] = {mesh->twin[h_last], mesh->twin[g_next], second + 2,
+	                          mesh->twin[g_last], mesh->twin[h_next], first + 2};
+	for (int k = 0; k < 6; k++)
+		unlist(mesh, was[k]);
+	for (int k = 0; k < 6; k++) {
+		mesh->origin[is[k]] = corner[k];
+		enlist(mesh, is[k]);
+		join(mesh, is[k], twin[k]);
+	}
+}
+
 static int reserve(const struct surface *surface, uint32_t spare, struct arena *arena, struct halfedge_mesh *ret)
 {
 	uint32_t cap_nt = surface->nt + spare;

@@ -67,6 +67,10 @@ uint32_t halfedge_valence(const struct halfedge_mesh *mesh, uint32_t v); /* tria
 void halfedge_add(struct halfedge_mesh *mesh, uint32_t slot, uint32_t a, uint32_t b, uint32_t c);
 void halfedge_remove(struct halfedge_mesh *mesh, uint32_t triangle);
 
+/* Turns the edge of h, which has a twin, to the other diagonal, which must not exist yet: (tip of h, origin of h, tip of the
+ * twin) takes the slot of h, the other triangle that of the twin. As removing both and adding these. */
+void halfedge_flip(struct halfedge_mesh *mesh, uint32_t h);
+
 /* The triangles at vertex v, in the order of its list: half-edge h[k] runs from v to x[k], the third corner is y[k]. */
 #define HALFEDGE_RING_MAX 64
 struct halfedge_ring {

@@ -119,6 +119,43 @@ static void a_triangle_that_is_removed_and_added_again_changes_nothing(void **st
 	arena_finish(&arena);
 }
 
+/* The same lists too: what comes later goes through them in order. */
+static void a_flip_is_two_triangles_removed_and_two_added(void **state)
+{
+	(void)state;
+	struct arena arena;
+	arena_init(&arena);
+	for (uint64_t seed = 0; seed < 8; seed++) {
+		struct halfedge_mesh mesh, other;
+		uint32_t flips = 0;
+		arena_reset(&arena);
+		make_mesh(&arena, (struct window_noise){seed, 400, 3}, &mesh);
+		make_mesh(&arena, (struct window_noise){seed, 400, 3}, &other);
+		for (uint32_t h = 0; h < 3 * mesh.nt; h++) {
+			uint32_t g = mesh.twin[h];
+			if (g == HALFEDGE_NONE)
+				continue;
+			uint32_t a = mesh.origin[h], b = mesh.origin[g];
+			uint32_t c = mesh.origin[halfedge_previous(h)], d = mesh.origin[halfedge_previous(g)];
+			if (c == d || halfedge_joined(&mesh, c, d))
+				continue;
+			halfedge_flip(&mesh, h);
+			halfedge_remove(&other, h / 3);
+			halfedge_remove(&other, g / 3);
+			halfedge_add(&other, h / 3, c, a, d);
+			halfedge_add(&other, g / 3, d, b, c);
+			flips++;
+		}
+		assert_true(flips > 100);
+		assert_null(halfedge_check(&mesh));
+		assert_memory_equal(mesh.first, other.first, mesh.nv * sizeof *mesh.first);
+		assert_memory_equal(mesh.origin, other.origin, 3 * mesh.nt * sizeof *mesh.origin);
+		assert_memory_equal(mesh.twin, other.twin, 3 * mesh.nt * sizeof *mesh.twin);
+		assert_memory_equal(mesh.next_leaving, other.next_leaving, 3 * mesh.nt * sizeof *mesh.next_leaving);
+	}
+	arena_finish(&arena);
+}
+
 static void an_edge_of_three_faces_is_refused(void **state)
 {
 	(void)state;
@@ -185,6 +222,7 @@ int main(void)
 	    cmocka_unit_test(raw_surfaces_of_random_fields_are_sound),
 	    cmocka_unit_test(every_collapse_that_may_be_keeps_a_surface_of_the_same_kind),
 	    cmocka_unit_test(a_triangle_that_is_removed_and_added_again_changes_nothing),
+	    cmocka_unit_test(a_flip_is_two_triangles_removed_and_two_added),
 	    cmocka_unit_test(an_edge_of_three_faces_is_refused),
 	    cmocka_unit_test(a_tetrahedron_and_a_lone_triangle_do_not_collapse),
 	    cmocka_unit_test(the_check_finds_each_broken_invariant),

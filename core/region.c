@@ -28,18 +28,26 @@
 #define SLAB_SHARE    0.5  /* of the tolerance, to either side */
 #define SEED_SPREAD   0.35 /* variance of a bin about its plane, in squared slabs */
 #define COSINE_WITHIN 0.5  /* 60 degrees */
-#define FLIPS_MAX     8    /* per edge, against rings of equal circles */
+#define COSINE_DOUBT  1e-9 /* of squares of cosines: far beyond all roundings */
+#define STRIPS        (PATCH_SIDE + 1)
+#define FLIPS_MAX     8 /* per edge, against rings of equal circles */
 
 /* Between these the square of theta swallows the 1 that Jacobi adds to it, and that of t is swallowed: the roots need not be
  * taken, the bits are the same. */
 #define THETA_LARGE 0x1p28
 #define THETA_HUGE  0x1p500
 
+/* The normal of a triangle, twice its area long, and the square of that. */
+struct turn {
+	struct vec3 normal;
+	double squared;
+};
+
 struct grower {
 	struct simplify *s;
 	struct arena *arena;
 	struct vec3 *place;      /* [nv] */
-	struct vec3 *normal;     /* [nt] unit */
+	struct turn *turn;       /* [nt] */
 	uint32_t *region;        /* [cap_nt] number, or NONE */
 	uint32_t *taken, n;      /* triangles of the region that grows */
 	uint32_t *vertex, nv;    /* its vertices */
@@ -140,12 +148,24 @@ static double component(struct vec3 v, int axis)
 	return axis == 0 ? v.x : axis == 1 ? v.y : v.z;
 }
 
-/* Whether triangle t is in no region and turned the plane's way. */
+static struct vec3 unit_normal(const struct turn *turn)
+{
+	return vec3_scale(turn->normal, 1 / sqrt(turn->squared));
+}
+
+/* Whether triangle t is in no region and turned the plane's way. The unit normal decides, but its root is taken only where
+ * the angle is so near to the bound that roundings matter. */
 static bool turned_alike(const struct grower *g, uint32_t t)
 {
-	double along = component(g->normal[t], g->axis);
-	return g->region[t] == NONE && vec3_dot(g->normal[t], g->plane.normal) >= COSINE_WITHIN &&
-	       (g->mirrored ? along < 0 : along > 0);
+	const struct turn *turn = &g->turn[t];
+	double along = component(turn->normal, g->axis);
+	if (g->region[t] != NONE || !(g->mirrored ? along < 0 : along > 0))
+		return false;
+	double cosine = vec3_dot(turn->normal, g->plane.normal);
+	double over = cosine * cosine - COSINE_WITHIN * COSINE_WITHIN * turn->squared;
+	if (fabs(over) > COSINE_DOUBT * turn->squared)
+		return cosine > 0 && over > 0;
+	return vec3_dot(unit_normal(turn), g->plane.normal) >= COSINE_WITHIN;
 }
 
 static bool fits(const struct grower *g, uint32_t t)
@@ -211,7 +231,7 @@ static double fit(struct grower *g, const uint32_t *vertex, uint32_t n, uint32_t
 	for (uint32_t k = 0; k < n; k++)
 		g->point[k] = g->place[vertex[k]];
 	g->plane = region_fit(g->point, n, &variance);
-	if (vec3_dot(g->plane.normal, g->normal[t]) < 0)
+	if (vec3_dot(g->plane.normal, unit_normal(&g->turn[t])) < 0)
 		g->plane = (struct region_plane){vec3_scale(g->plane.normal, -1), -g->plane.offset};
 	choose_axis(g);
 	return variance;
@@ -311,13 +331,9 @@ static bool flip(struct grower *g, uint32_t h)
 	const uint8_t *faces = g->s->border.faces;
 	if ((faces[c] & faces[d]) || c == d || halfedge_joined(mesh, c, d))
 		return false;
-	uint32_t first = h / 3, second = twin / 3;
-	halfedge_remove(mesh, first);
-	halfedge_remove(mesh, second);
-	halfedge_add(mesh, first, c, a, d);
-	halfedge_add(mesh, second, d, b, c);
-	want_look(g, first);
-	want_look(g, second);
+	halfedge_flip(mesh, h);
+	want_look(g, h / 3);
+	want_look(g, twin / 3);
 	return true;
 }
 
@@ -338,6 +354,13 @@ struct cover {
 	struct flat flat;
 };
 
+/* The triangles of the outline; a bit each for those that reach into a strip of one cell, along either axis. */
+struct covers {
+	struct cover *cover;
+	uint64_t *strip[2][STRIPS]; /* [words] */
+	uint32_t n, words;
+};
+
 static void cover_make(const struct grower *g, uint32_t t, struct cover *ret)
 {
 	const uint32_t *corner = &g->s->mesh.origin[3 * t];
@@ -350,8 +373,38 @@ static void cover_make(const struct grower *g, uint32_t t, struct cover *ret)
 	ret->made = false;
 }
 
+static void note_strips(const struct grower *g, struct covers *covers, uint32_t k)
+{
+	const uint32_t *corner = &g->s->mesh.origin[3 * g->taken[k]];
+	const int32_t *a = g->projected[corner[0]], *b = g->projected[corner[1]], *c = g->projected[corner[2]];
+	for (int axis = 0; axis < 2; axis++) {
+		int32_t low = a[axis] < b[axis] ? a[axis] : b[axis], high = a[axis] < b[axis] ? b[axis] : a[axis];
+		low = c[axis] < low ? c[axis] : low;
+		high = c[axis] > high ? c[axis] : high;
+		for (int32_t strip = low / LATTICE; strip <= high / LATTICE; strip++)
+			covers->strip[axis][strip][k / 64] |= (uint64_t)1 << k % 64;
+	}
+}
+
+/* Of the first `n` slots of the region. */
+static int covers_make(const struct grower *g, uint32_t n, struct covers *ret)
+{
+	uint32_t words = (n + 63) / 64;
+	uint64_t *bits = ARENA_NEW(g->arena, uint64_t, 2 * STRIPS * words);
+	*ret = (struct covers){.cover = ARENA_TAKE(g->arena, struct cover, n), .n = n, .words = words};
+	if (!bits || !ret->cover)
+		return -ENOMEM;
+	for (uint32_t k = 0; k < 2 * STRIPS; k++)
+		ret->strip[k / STRIPS][k % STRIPS] = bits + k * words;
+	for (uint32_t k = 0; k < n; k++) {
+		cover_make(g, g->taken[k], &ret->cover[k]);
+		note_strips(g, ret, k);
+	}
+	return 0;
+}
+
 /* Sides are taken together: which one refuses is a coin's toss that no processor foresees. */
-static bool covers(const struct cover *cover, const int32_t p[2])
+static bool covers_point(const struct cover *cover, const int32_t p[2])
 {
 	int32_t side[3];
 	for (int k = 0; k < 3; k++)
@@ -359,37 +412,46 @@ static bool covers(const struct cover *cover, const int32_t p[2])
 	return (side[0] | side[1] | side[2]) >= 0;
 }
 
-/* Gives vertex v, which went, to the triangle over or under it; false where that is farther than the tolerance. */
-static bool hand_over(struct grower *g, uint32_t v, struct cover *cover, uint32_t n)
+/* Gives vertex v, which went, to the triangle over or under it, if it is that; false where it is not, or too far. */
+static bool hand_to(struct grower *g, uint32_t v, struct cover *cover, uint32_t t)
 {
 	struct simplify *s = g->s;
-	for (uint32_t k = 0; k < n; k++) {
-		if (!covers(&cover[k], g->projected[v]))
-			continue;
-		uint32_t t = g->taken[k];
-		const uint32_t *corner = &s->mesh.origin[3 * t];
-		if (!cover[k].made)
-			cover[k].flat = flat_make(g->place[corner[0]], g->place[corner[1]], g->place[corner[2]]);
-		cover[k].made = true;
-		if (flat_distance_squared(&cover[k].flat, s->origin[v]) > s->tolerance_squared)
-			continue;
-		s->next_point[v] = s->points[t];
-		s->points[t] = v;
-		return true;
-	}
+	if (!covers_point(cover, g->projected[v]))
+		return false;
+	const uint32_t *corner = &s->mesh.origin[3 * t];
+	if (!cover->made)
+		cover->flat = flat_make(g->place[corner[0]], g->place[corner[1]], g->place[corner[2]]);
+	cover->made = true;
+	if (flat_distance_squared(&cover->flat, s->origin[v]) > s->tolerance_squared)
+		return false;
+	s->next_point[v] = s->points[t];
+	s->points[t] = v;
+	return true;
+}
+
+/* To the first that takes it; false where none does. */
+static bool hand_over(struct grower *g, uint32_t v, struct covers *covers)
+{
+	const uint64_t *column = covers->strip[0][g->projected[v][0] / LATTICE];
+	const uint64_t *row = covers->strip[1][g->projected[v][1] / LATTICE];
+	for (uint32_t word = 0; word < covers->words; word++)
+		for (uint64_t near = column[word] & row[word]; near; near &= near - 1) {
+			uint32_t k = 64 * word + (uint32_t)__builtin_ctzll(near);
+			if (hand_to(g, v, &covers->cover[k], g->taken[k]))
+				return true;
+		}
 	return false;
 }
 
 /* The vertices that went, in the triangles that came: the first `n` slots. 0, -EDOM or -ENOMEM. */
 static int hand_over_all(struct grower *g, uint32_t n)
 {
-	struct cover *cover = ARENA_TAKE(g->arena, struct cover, n);
-	if (!cover)
-		return -ENOMEM;
-	for (uint32_t k = 0; k < n; k++)
-		cover_make(g, g->taken[k], &cover[k]);
+	struct covers covers;
+	int r = covers_make(g, n, &covers);
+	if (r)
+		return r;
 	for (uint32_t k = 0; k < g->nv; k++)
-		if (g->s->mesh.first[g->vertex[k]] == HALFEDGE_NONE && !hand_over(g, g->vertex[k], cover, n))
+		if (g->s->mesh.first[g->vertex[k]] == HALFEDGE_NONE && !hand_over(g, g->vertex[k], &covers))
 			return -EDOM;
 	return 0;
 }
@@ -603,7 +665,7 @@ static int prepare(struct grower *g, struct simplify *s, struct arena *arena)
 	const struct halfedge_mesh *mesh = &s->mesh;
 	*g = (struct grower){.s = s, .arena = arena, .slab = SLAB_SHARE * sqrt(s->tolerance_squared)};
 	g->place = ARENA_TAKE(arena, struct vec3, mesh->nv);
-	g->normal = ARENA_TAKE(arena, struct vec3, mesh->nt);
+	g->turn = ARENA_TAKE(arena, struct turn, mesh->nt);
 	g->region = ARENA_TAKE(arena, uint32_t, mesh->cap_nt);
 	g->taken = ARENA_TAKE(arena, uint32_t, mesh->nt);
 	g->vertex = ARENA_TAKE(arena, uint32_t, mesh->nv);
@@ -612,7 +674,7 @@ static int prepare(struct grower *g, struct simplify *s, struct arena *arena)
 	g->settled = ARENA_NEW(arena, bool, 3 * (size_t)mesh->nt);
 	g->point = ARENA_TAKE(arena, struct vec3, mesh->nv);
 	s->region = ARENA_TAKE(arena, struct region_plane, BINS);
-	if (!g->place || !g->normal || !g->region || !g->taken || !g->vertex || !g->seen || !g->projected ||
+	if (!g->place || !g->turn || !g->region || !g->taken || !g->vertex || !g->seen || !g->projected ||
 	    !g->settled || !g->point || !s->region)
 		return -ENOMEM;
 	memset(g->region, 0xff, mesh->cap_nt * sizeof *g->region);
@@ -624,7 +686,7 @@ static int prepare(struct grower *g, struct simplify *s, struct arena *arena)
 		const uint32_t *corner = &mesh->origin[3 * t];
 		struct vec3 a = g->place[corner[0]];
 		struct vec3 n = vec3_cross(vec3_sub(g->place[corner[1]], a), vec3_sub(g->place[corner[2]], a));
-		g->normal[t] = vec3_scale(n, 1 / vec3_norm(n));
+		g->turn[t] = (struct turn){n, vec3_dot(n, n)};
 	}
 	return 0;
 }

@@ -94,7 +94,8 @@ static struct vec3 target_of(const struct step *step, uint32_t k, double most)
 	if (length == 0)
 		return at;
 	double way = STEP_SHARE * vec3_dot(sum, normal) / ((end - first) * length);
-	way = way > most ? most : way < -most ? -most : way;
+	way = way < most ? way : most;
+	way = way > -most ? way : -most;
 	return vec3_add(at, vec3_scale(normal, way / length));
 }
 

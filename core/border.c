@@ -83,13 +83,23 @@ static const int16_t *corner(const struct face *face, int p, int q)
 	return &face->window->value[window_at(at[0], at[1], at[2])];
 }
 
+static bool inside(const struct face *face, int p, int q)
+{
+	int at[3];
+	at[face->axis] = face->high ? SIDE : 0;
+	at[face->in[0]] = p;
+	at[face->in[1]] = q;
+	return face->window->inside[window_row(at[1], at[2])] >> (at[0] + WINDOW_LOW) & 1;
+}
+
+/* Whether the cell of this patch, or that behind the face, is complete; asked where the square's corners differ only. */
 static bool cell_complete(const struct face *face, int p, int q, bool own)
 {
 	int at[3];
 	at[face->axis] = face->high ? (own ? SIDE - 1 : SIDE) : (own ? 0 : -1);
 	at[face->in[0]] = p;
 	at[face->in[1]] = q;
-	return window_cell_complete(face->window, at[0], at[1], at[2]);
+	return window_active(face->window, at[0], at[1], at[2]);
 }
 
 static void place_node(struct face *face, int node)
@@ -120,8 +130,8 @@ static void add_segment(struct face *face, int a, int b, bool shared, bool forei
 /* The segments of one square: two crossed edges joined, or the negative corners cut off. */
 static void draw_square(struct face *face, int p, int q)
 {
-	bool s00 = *corner(face, p, q) < 0, s10 = *corner(face, p + 1, q) < 0;
-	bool s01 = *corner(face, p, q + 1) < 0, s11 = *corner(face, p + 1, q + 1) < 0;
+	bool s00 = inside(face, p, q), s10 = inside(face, p + 1, q);
+	bool s01 = inside(face, p, q + 1), s11 = inside(face, p + 1, q + 1);
 	if (s00 == s10 && s00 == s01 && s00 == s11)
 		return;
 	bool own = cell_complete(face, p, q, true), foreign = cell_complete(face, p, q, false);

@@ -1,72 +1,49 @@
 /* Marching cubes on one patch: gather, fill, extract.
  *
- * What costs is not the cells but getting at them: 21^3 values lie in up to 64 blocks. So a block is looked up once
- * and its part copied row by row, and everything that asks for signs or completeness works on rows of bits, one bit a
- * corner, 21 corners a row. An empty cell then costs a fraction of an instruction, and only the cells that hold
- * surface are ever visited one by one.
+ * What costs is not the cells but getting at them: 21^3 values lie in up to 64 blocks. So everything that asks for signs
+ * or completeness works on rows of bits, one bit a corner, 21 corners a row, put together from the bits that blocks keep.
+ * Only the cells that hold surface are ever visited one by one, and only values beside the surface are ever read.
  *
  * Filling closes the slit along concave and convex edges, where the corner behind both surfaces was never seen. It
- * reads unfilled values only, so one pass gives the same whatever the order. A filled corner is given its value only
- * where a cell with a surface reads it: elsewhere (the outer rim of every known band) it would change nothing and cost
- * more than all the rest.
+ * reads unfilled values only, so one pass gives the same whatever the order.
  *
  * A vertex lies on the edge from a voxel along an axis, at |a| / (|a| + |b|) of it in 1/256, halves rounded away from
  * the voxel, clamped to [4, 252]: integers only, and no two vertices of a cell ever coincide. It depends on these two
- * values alone, so the neighbouring patch computes the same point. */
+ * values alone, so the neighbouring patch computes the same point.
+ *
+ * The digest is one of all that extraction and border.c read, so equal digests mean equal surfaces and borders:
+ *   - which cells have a surface: the patch's own and, for the border, those behind its faces. A border segment is drawn
+ *     in a square whose corners differ; there `complete` and `has a surface` are the same;
+ *   - which corners are the end of an edge that crosses the surface in one of these cells, and their signs. That is the
+ *     sign of every corner of these cells: from one that is not such an end, edges of the cell lead over corners of
+ *     the same sign to one that is, since a cell of one sign has no surface;
+ *   - the values of these ends: a vertex reads no others. Edges of cells behind a face count only where they lie in it.
+ * What the fill read is not in it, only what it gave. */
 #include "core/cubes.h"
 
 #include <assert.h>
 #include <errno.h>
 #include <string.h>
 
-#define ROWS (WINDOW_SIDE * WINDOW_SIDE)
-
-/* Bits of a row: corner i is bit i + WINDOW_LOW. */
+/* Bits of a row: corner, or cell, i is bit i + WINDOW_LOW. */
+#define CORNERS_OWN    (((1u << (PATCH_SIDE + 1)) - 1) << WINDOW_LOW)       /* 0 .. 16 */
 #define CORNERS_FILLED (((1u << (PATCH_SIDE + 3)) - 1) << (WINDOW_LOW - 1)) /* -1 .. 17 */
+#define CELLS_OWN      (((1u << PATCH_SIDE) - 1) << WINDOW_LOW)             /* 0 .. 15 */
 #define CELLS_HALO     (((1u << (PATCH_SIDE + 2)) - 1) << (WINDOW_LOW - 1)) /* -1 .. 16 */
-
-static_assert(__BYTE_ORDER__ == __ORDER_LITTLE_ENDIAN__, "four values are judged in one little-endian word");
 
 /* Rows are judged four at a time. */
 typedef uint32_t rows4 __attribute__((vector_size(16)));
-#define ROWS_PADDED (ROWS + 4)
+#define ROWS_PADDED (WINDOW_ROWS + 4)
 
-/* Known and inside bits of the rows of a window, before and after the fill. Rows of corners outside -1 .. 17 hold
- * nothing of meaning in the last five. */
+/* The rows of a window, before and after the fill. Rows of corners outside -1 .. 17 hold nothing of meaning behind `filled`. */
 struct rows {
 	uint32_t known[ROWS_PADDED], inside[ROWS_PADDED];
 	uint32_t filled[ROWS_PADDED]; /* corners the fill makes known */
 	uint32_t known_after[ROWS_PADDED], inside_after[ROWS_PADDED];
-	uint32_t active[ROWS_PADDED]; /* cells with a surface */
-	uint32_t needed[ROWS_PADDED]; /* corners of cells with a surface */
+	uint32_t active[ROWS_PADDED];                            /* cells with a surface */
+	uint32_t crossed_y[ROWS_PADDED], crossed_z[ROWS_PADDED]; /* edges that cross it, from their lower corner */
+	uint32_t ends[ROWS_PADDED];                              /* of edges that cross it */
 };
-
-static int row_at(int j, int k)
-{
-	return (k + WINDOW_LOW) * WINDOW_SIDE + j + WINDOW_LOW;
-}
-
-/* The published values of four voxels in one word. */
-static inline uint64_t pack4(const struct voxel *v)
-{
-	return (uint64_t)(uint16_t)v[0].published | (uint64_t)(uint16_t)v[1].published << 16 |
-	       (uint64_t)(uint16_t)v[2].published << 32 | (uint64_t)(uint16_t)v[3].published << 48;
-}
-
-/* The upper bits of the eight quarters of two words, as bits 0 .. 7. The factor moves bit 16 m (and 16 m + 4, which the
- * second word is shifted to) to 48 + m (52 + m); no other product reaches bit 48 without leaving the word. */
-static inline uint32_t top_bits(uint64_t low, uint64_t high)
-{
-	const uint64_t each = 0x0001000100010001ull;
-	return ((low >> 15 & each) | (high >> 11 & each << 4)) * 0x0001000200040008ull >> 48 & 0xff;
-}
-
-/* The upper bit of every quarter that is not zero. */
-static inline uint64_t not_zero(uint64_t word)
-{
-	const uint64_t low = 0x7fff7fff7fff7fffull;
-	return ((word & low) + low) | word;
-}
 
 /* How the layers of block `b` (-1 .. 2 from the patch's own first) lie in the window along one axis. */
 static void block_layers(int b, int *ret_first, int *ret_count, int *ret_place)
@@ -76,63 +53,32 @@ static void block_layers(int b, int *ret_first, int *ret_count, int *ret_place)
 	*ret_place = b < 0 ? 0 : WINDOW_LOW + b * BLOCK_SIDE;
 }
 
-/* Eight voxels to eight values and their bits. */
-static inline void copy_eight(const struct voxel *from, int16_t *to, uint32_t *ret_known, uint32_t *ret_inside)
-{
-	const uint64_t unknown = 0x8000800080008000ull;
-	uint64_t words[2] = {pack4(from), pack4(from + 4)};
-	memcpy(to, words, sizeof words);
-	*ret_known = top_bits(not_zero(words[0] ^ unknown), not_zero(words[1] ^ unknown));
-	*ret_inside = top_bits(words[0], words[1]) & *ret_known;
-}
-
-static inline void copy_few(const struct voxel *from, int n, int16_t *to, uint32_t *ret_known, uint32_t *ret_inside)
-{
-	*ret_known = *ret_inside = 0;
-	for (int x = 0; x < n; x++) {
-		int16_t value = to[x] = from[x].published;
-		*ret_known |= (uint32_t)(value != VOXEL_UNKNOWN) << x;
-		*ret_inside |= (uint32_t)(value != VOXEL_UNKNOWN && value < 0) << x;
-	}
-}
-
-static void copy_block(const struct block *block, const int at[3], int16_t *value, struct rows *rows)
+static void copy_block(const struct block *block, const int at[3], struct rows *rows)
 {
 	int first[3], count[3], place[3];
 	for (int axis = 0; axis < 3; axis++)
 		block_layers(at[axis], &first[axis], &count[axis], &place[axis]);
-	for (int z = 0; z < count[2]; z++)
-		for (int y = 0; y < count[1]; y++) {
-			const struct voxel *from =
-			    &block->voxel[((z + first[2]) * BLOCK_SIDE + y + first[1]) * BLOCK_SIDE + first[0]];
-			int row = (z + place[2]) * WINDOW_SIDE + y + place[1];
-			int16_t *to = &value[row * WINDOW_SIDE + place[0]];
-			uint32_t known, inside;
-			if (count[0] == BLOCK_SIDE)
-				copy_eight(from, to, &known, &inside);
-			else
-				copy_few(from, count[0], to, &known, &inside);
-			rows->known[row] |= known << place[0];
-			rows->inside[row] |= inside << place[0];
+	const uint32_t mask = (1u << count[0]) - 1;
+	for (int z = 0; z < count[2]; z++) {
+		uint64_t known = block->known[z + first[2]], inside = block->inside[z + first[2]];
+		if (!known)
+			continue;
+		known >>= first[1] * BLOCK_SIDE + first[0];
+		inside >>= first[1] * BLOCK_SIDE + first[0];
+		int row = (z + place[2]) * WINDOW_SIDE + place[1];
+		for (int y = 0; y < count[1]; y++, row++, known >>= BLOCK_SIDE, inside >>= BLOCK_SIDE) {
+			rows->known[row] |= ((uint32_t)known & mask) << place[0];
+			rows->inside[row] |= ((uint32_t)inside & mask) << place[0];
 		}
+	}
 }
 
-/* All unknown: from one value by doubling, at the speed of memcpy. */
-static void forget_values(int16_t *value)
-{
-	size_t n = 1;
-	value[0] = VOXEL_UNKNOWN;
-	for (; n * 2 <= WINDOW_VOXELS; n *= 2)
-		memcpy(value + n, value, n * sizeof *value);
-	memcpy(value + n, value, (WINDOW_VOXELS - n) * sizeof *value);
-}
-
-#define BLOCKS_A_SIDE 4
+#define BLOCKS (GRID_BOX_SIDE * GRID_BOX_SIDE * GRID_BOX_SIDE)
 
 /* Block (x, y, z) of the 4^3 that a window reads; the patch's own are 1 and 2 on each axis. */
 static int block_at(int x, int y, int z)
 {
-	return (z * BLOCKS_A_SIDE + y) * BLOCKS_A_SIDE + x;
+	return (z * GRID_BOX_SIDE + y) * GRID_BOX_SIDE + x;
 }
 
 static bool own_block(int b)
@@ -140,42 +86,25 @@ static bool own_block(int b)
 	return b == 1 || b == 2;
 }
 
-/* Looks the blocks up that share a face with the patch or belong to it, or all others. The bits of *ret_axes: 1, 2, 4 a
- * neighbour exists along x, y, z; 8 one of the patch's own. */
-static void find_blocks(const struct grid *grid, struct patch_key key, bool others, const struct block **ret_blocks,
-                        int *ret_axes)
-{
-	for (int z = 0; z < BLOCKS_A_SIDE; z++)
-		for (int y = 0; y < BLOCKS_A_SIDE; y++)
-			for (int x = 0; x < BLOCKS_A_SIDE; x++) {
-				int outside = !own_block(x) + 2 * !own_block(y) + 4 * !own_block(z);
-				bool near = outside == 0 || (outside & (outside - 1)) == 0;
-				struct block_key name = {key.x * 2 + x - 1, key.y * 2 + y - 1, key.z * 2 + z - 1};
-				if (near == others)
-					continue;
-				ret_blocks[block_at(x, y, z)] = grid_find(grid, name);
-				if (near && ret_blocks[block_at(x, y, z)])
-					*ret_axes |= outside ? outside : 8;
-			}
-}
-
 /* A cell of the patch has a corner in one of the patch's own blocks. Where there is none of them, that corner must be a
  * filled one, so there are neighbours on two axes: most of the patches around a surface are told apart by this alone. */
-static bool may_have_cells(int axes)
+static bool may_have_cells(const struct block *const *blocks)
 {
+	int axes = 0;
+	for (int z = 0; z < GRID_BOX_SIDE; z++)
+		for (int y = 0; y < GRID_BOX_SIDE; y++)
+			for (int x = 0; x < GRID_BOX_SIDE; x++) {
+				int outside = !own_block(x) + 2 * !own_block(y) + 4 * !own_block(z);
+				bool near = outside == 0 || (outside & (outside - 1)) == 0;
+				if (near && blocks[block_at(x, y, z)])
+					axes |= outside ? outside : 8;
+			}
 	return axes >= 8 || (axes & (axes - 1)) != 0;
 }
 
-/* False where no cell of the patch can be complete; then nothing was copied. */
-static bool copy_blocks(const struct grid *grid, struct patch_key key, int16_t *value, struct rows *rows)
+static void copy_blocks(const struct block *const *blocks, struct rows *rows)
 {
-	const struct block *blocks[BLOCKS_A_SIDE * BLOCKS_A_SIDE * BLOCKS_A_SIDE];
-	int axes = 0, at[3];
-	find_blocks(grid, key, false, blocks, &axes);
-	if (!may_have_cells(axes))
-		return false;
-	find_blocks(grid, key, true, blocks, &axes);
-	forget_values(value);
+	int at[3];
 	memset(rows->known, 0, sizeof rows->known);
 	memset(rows->inside, 0, sizeof rows->inside);
 	for (at[2] = -1; at[2] < 3; at[2]++)
@@ -183,16 +112,15 @@ static bool copy_blocks(const struct grid *grid, struct patch_key key, int16_t *
 			for (at[0] = -1; at[0] < 3; at[0]++) {
 				const struct block *block = blocks[block_at(at[0] + 1, at[1] + 1, at[2] + 1)];
 				if (block)
-					copy_block(block, at, value, rows);
+					copy_block(block, at, rows);
 			}
-	return true;
 }
 
 /* Whether both signs occur. */
 static bool both_signs(const struct rows *rows)
 {
 	uint32_t inside = 0, outside = 0;
-	for (int r = 0; r < ROWS; r++) {
+	for (int r = 0; r < WINDOW_ROWS; r++) {
 		inside |= rows->inside[r];
 		outside |= rows->known[r] & ~rows->inside[r];
 	}
@@ -243,110 +171,213 @@ static inline void find_active(struct rows *rows, int r)
 	store_rows(&rows->active[r], all & all >> 1 & (any | any >> 1) & ~(every & every >> 1) & CELLS_HALO);
 }
 
-/* Finds the filled corners, the cells with a surface and the corners these need. */
-static void find_cells(struct rows *rows)
+/* Cells that share no face with the patch are nobody's business here. */
+static void drop_far_cells(struct rows *rows)
 {
-	for (int r = row_at(-1, -1); r <= row_at(PATCH_SIDE + 1, PATCH_SIDE + 1); r += 4)
-		fill_rows(rows, r);
-	for (int r = row_at(-1, -1); r <= row_at(PATCH_SIDE, PATCH_SIDE); r += 4)
-		find_active(rows, r);
-	memset(rows->needed, 0, sizeof rows->needed);
-	for (int k = -1; k <= PATCH_SIDE; k++)
-		for (int j = -1; j <= PATCH_SIDE; j++) {
-			int r = row_at(j, k);
-			uint32_t corners = rows->active[r] | rows->active[r] << 1;
-			if (!corners)
-				continue;
-			rows->needed[r] |= corners;
-			rows->needed[r + 1] |= corners;
-			rows->needed[r + WINDOW_SIDE] |= corners;
-			rows->needed[r + WINDOW_SIDE + 1] |= corners;
-		}
+	for (int n = -1; n <= PATCH_SIDE; n++) {
+		const uint32_t cells = n < 0 || n == PATCH_SIDE ? 0 : CELLS_OWN;
+		rows->active[window_row(-1, n)] &= cells;
+		rows->active[window_row(PATCH_SIDE, n)] &= cells;
+		rows->active[window_row(n, -1)] &= cells;
+		rows->active[window_row(n, PATCH_SIDE)] &= cells;
+	}
 }
 
-/* Hands the patch's own cells with a surface, and the corners around them, to the extraction; false where there are none. */
-static bool keep_cells(const struct rows *rows, struct window *window)
+static bool own_cells(const struct rows *rows)
 {
 	uint32_t any = 0;
 	for (int k = 0; k < PATCH_SIDE; k++)
-		for (int j = 0; j < PATCH_SIDE; j++) {
-			uint32_t own = rows->active[row_at(j, k)] >> WINDOW_LOW & ((1u << PATCH_SIDE) - 1);
-			window->active[k * PATCH_SIDE + j] = (uint16_t)own;
-			any |= own;
-		}
-	memcpy(window->inside, rows->inside_after, sizeof window->inside);
-	return any;
+		for (int j = 0; j < PATCH_SIDE; j++)
+			any |= rows->active[window_row(j, k)];
+	return any & CELLS_OWN;
+}
+
+/* The edges along y and z that cross the surface in a cell beside them, in four rows from `r` on. */
+static inline void cross_y(struct rows *rows, int r)
+{
+	const uint32_t *active = &rows->active[r], *inside = &rows->inside_after[r];
+	rows4 cells = load_rows(active) | load_rows(active - WINDOW_SIDE);
+	store_rows(&rows->crossed_y[r],
+	           (load_rows(inside) ^ load_rows(inside + 1)) & (cells | cells << 1) & CORNERS_OWN);
+}
+
+static inline void cross_z(struct rows *rows, int r)
+{
+	const uint32_t *active = &rows->active[r], *inside = &rows->inside_after[r];
+	rows4 cells = load_rows(active) | load_rows(active - 1);
+	store_rows(&rows->crossed_z[r],
+	           (load_rows(inside) ^ load_rows(inside + WINDOW_SIDE)) & (cells | cells << 1) & CORNERS_OWN);
+}
+
+/* The same along x, and the ends of all three. */
+static inline void find_ends(struct rows *rows, int r)
+{
+	const uint32_t *active = &rows->active[r], *y = &rows->crossed_y[r], *z = &rows->crossed_z[r];
+	rows4 cells = load_rows(active) | load_rows(active - 1) | load_rows(active - WINDOW_SIDE) |
+	              load_rows(active - WINDOW_SIDE - 1);
+	rows4 inside = load_rows(&rows->inside_after[r]), x = (inside ^ inside >> 1) & cells & CELLS_OWN;
+	store_rows(&rows->ends[r],
+	           x | x << 1 | load_rows(y) | load_rows(y - 1) | load_rows(z) | load_rows(z - WINDOW_SIDE));
+}
+
+/* Edges between corners 0 .. 16. Four rows at a time make 20 for 17: what rows 17 .. 19 get is never read. */
+static void cross_edges(struct rows *rows)
+{
+	memset(rows->crossed_y, 0, sizeof rows->crossed_y);
+	memset(rows->crossed_z, 0, sizeof rows->crossed_z);
+	memset(rows->ends, 0, sizeof rows->ends);
+	for (int k = 0; k <= PATCH_SIDE; k++)
+		for (int j = 0; j < PATCH_SIDE; j += 4)
+			cross_y(rows, window_row(j, k));
+	for (int k = 0; k < PATCH_SIDE; k++)
+		for (int j = 0; j <= PATCH_SIDE; j += 4)
+			cross_z(rows, window_row(j, k));
+	for (int k = 0; k <= PATCH_SIDE; k++)
+		for (int j = 0; j <= PATCH_SIDE; j += 4)
+			find_ends(rows, window_row(j, k));
+}
+
+/* Of a known corner -1 .. 17. */
+static int16_t published(const struct block *const *blocks, int i, int j, int k)
+{
+	const int in = BLOCK_SIDE - 1;
+	const struct block *block =
+	    blocks[block_at((i >> BLOCK_SHIFT) + 1, (j >> BLOCK_SHIFT) + 1, (k >> BLOCK_SHIFT) + 1)];
+	return block->voxel[((k & in) * BLOCK_SIDE + (j & in)) * BLOCK_SIDE + (i & in)].published;
 }
 
 /* The known neighbour of largest magnitude; all have one sign, so equal magnitudes are equal values. */
-static int16_t strongest_neighbour(const int16_t *value, const struct rows *rows, int r, int b)
+static int16_t strongest_neighbour(const struct block *const *blocks, const struct rows *rows, int i, int j, int k)
 {
-	static const int step_row[6] = {0, 0, -1, 1, -WINDOW_SIDE, WINDOW_SIDE}, step_bit[6] = {-1, 1, 0, 0, 0, 0};
+	static const int8_t step[6][3] = {{-1, 0, 0}, {1, 0, 0}, {0, -1, 0}, {0, 1, 0}, {0, 0, -1}, {0, 0, 1}};
 	int16_t best = 0;
 	for (int s = 0; s < 6; s++) {
-		int row = r + step_row[s], bit = b + step_bit[s];
-		if (!(rows->known[row] >> bit & 1))
+		int x = i + step[s][0], y = j + step[s][1], z = k + step[s][2];
+		if (!(rows->known[window_row(y, z)] >> (x + WINDOW_LOW) & 1))
 			continue;
-		int16_t v = value[row * WINDOW_SIDE + bit];
+		int16_t v = published(blocks, x, y, z);
 		if (v < 0 ? v < best : v > best)
 			best = v;
 	}
 	return best;
 }
 
-static void fill_values(const struct rows *rows, int16_t *value)
+/* Asks for the rows of voxels that copy_values will read, so that they come together. */
+static void fetch_values(const struct block *const *blocks, const struct rows *rows)
 {
-	for (int k = -1; k <= PATCH_SIDE + 1; k++)
-		for (int j = -1; j <= PATCH_SIDE + 1; j++) {
-			int r = row_at(j, k);
-			for (uint32_t bits = rows->filled[r] & rows->needed[r]; bits; bits &= bits - 1) {
-				int b = __builtin_ctz(bits);
-				value[r * WINDOW_SIDE + b] = strongest_neighbour(value, rows, r, b);
+	const int in = BLOCK_SIDE - 1;
+	for (int k = 0; k <= PATCH_SIDE; k++)
+		for (int j = 0; j <= PATCH_SIDE; j++) {
+			uint32_t ends = rows->ends[window_row(j, k)] >> WINDOW_LOW;
+			int b = block_at(1, (j >> BLOCK_SHIFT) + 1, (k >> BLOCK_SHIFT) + 1);
+			for (; ends; ends >>= BLOCK_SIDE, b++)
+				if (ends & 0xff && blocks[b])
+					__builtin_prefetch(
+					    &blocks[b]->voxel[((k & in) * BLOCK_SIDE + (j & in)) * BLOCK_SIDE]);
+		}
+}
+
+/* The values at the ends of crossing edges, into the window and, four in a word, into its digest. */
+static void copy_values(const struct block *const *blocks, const struct rows *rows, struct window *window)
+{
+	struct digest digest = window->digest;
+	uint64_t word = 0;
+	uint32_t n = 0;
+	for (int k = 0; k <= PATCH_SIDE; k++)
+		for (int j = 0; j <= PATCH_SIDE; j++) {
+			int r = window_row(j, k);
+			for (uint32_t ends = rows->ends[r]; ends; ends &= ends - 1) {
+				int b = __builtin_ctz(ends), i = b - WINDOW_LOW;
+				int16_t value = rows->known[r] >> b & 1 ? published(blocks, i, j, k)
+				                                        : strongest_neighbour(blocks, rows, i, j, k);
+				window->value[r * WINDOW_SIDE + b] = value;
+				word = word << 16 | (uint16_t)value;
+				if ((++n & 3) == 0)
+					digest_word(&digest, word);
 			}
 		}
+	digest_word(&digest, word);
+	digest_word(&digest, n);
+	window->digest = digest;
+}
+
+/* Cells, crossing edges' ends and their signs: 18 + 17 + 17 bits of a row, and its number. */
+static struct digest digest_rows(const struct rows *rows)
+{
+	struct digest digest = {0, 0};
+	for (int k = -1; k <= PATCH_SIDE; k++)
+		for (int j = -1; j <= PATCH_SIDE; j++) {
+			int r = window_row(j, k);
+			uint64_t cells = rows->active[r], ends = rows->ends[r], inside = ends & rows->inside_after[r];
+			if (cells | ends)
+				digest_word(&digest, (uint64_t)r << 52 | cells >> (WINDOW_LOW - 1) << 34 |
+				                         ends >> WINDOW_LOW << 17 | inside >> WINDOW_LOW);
+		}
+	return digest;
 }
 
 void cubes_gather(const struct grid *grid, struct patch_key key, struct window *ret)
 {
 	assert(grid && ret);
+	const struct block *blocks[BLOCKS];
+	struct rows rows;
 	ret->key = key;
 	ret->empty = true;
-	struct rows rows;
-	if (!copy_blocks(grid, key, ret->value, &rows))
+	grid_find_box(grid, (struct block_key){key.x * 2 - 1, key.y * 2 - 1, key.z * 2 - 1}, blocks);
+	if (!may_have_cells(blocks))
 		return;
+	copy_blocks(blocks, &rows);
 	if (!both_signs(&rows))
 		return;
-	find_cells(&rows);
-	ret->empty = !keep_cells(&rows, ret);
-	if (!ret->empty)
-		fill_values(&rows, ret->value);
-}
-
-bool window_cell_complete(const struct window *window, int i, int j, int k)
-{
-	assert(i >= -1 && i <= PATCH_SIDE && j >= -1 && j <= PATCH_SIDE && k >= -1 && k <= PATCH_SIDE);
-	const int16_t *low = &window->value[window_at(i, j, k)], *high = low + WINDOW_SIDE * WINDOW_SIDE;
-	return low[0] != VOXEL_UNKNOWN && low[1] != VOXEL_UNKNOWN && low[WINDOW_SIDE] != VOXEL_UNKNOWN &&
-	       low[WINDOW_SIDE + 1] != VOXEL_UNKNOWN && high[0] != VOXEL_UNKNOWN && high[1] != VOXEL_UNKNOWN &&
-	       high[WINDOW_SIDE] != VOXEL_UNKNOWN && high[WINDOW_SIDE + 1] != VOXEL_UNKNOWN;
+	for (int r = window_row(-1, -1); r <= window_row(PATCH_SIDE + 1, PATCH_SIDE + 1); r += 4)
+		fill_rows(&rows, r);
+	for (int r = window_row(-1, -1); r <= window_row(PATCH_SIDE, PATCH_SIDE); r += 4)
+		find_active(&rows, r);
+	if (!own_cells(&rows))
+		return;
+	ret->empty = false;
+	drop_far_cells(&rows);
+	cross_edges(&rows);
+	fetch_values(blocks, &rows);
+	memcpy(ret->active, rows.active, sizeof ret->active);
+	memcpy(ret->inside, rows.inside_after, sizeof ret->inside);
+	ret->digest = digest_rows(&rows);
+	copy_values(blocks, &rows, ret);
 }
 
 /* Extraction. */
 #define CORNERS      (PATCH_SIDE + 1)
 #define VERTEX_NAMES (CORNERS * CORNERS * CORNERS * 3)
+#define ROW_NAMES    (CORNERS * 3)
 
 static_assert(VERTEX_NAMES < UINT16_MAX, "a vertex index of a raw patch fits 16 bits");
 
 struct active_cell {
-	uint8_t i, j, k, code;
+	uint16_t i, j, k;
+	uint8_t code;
 };
 
 struct extraction {
 	const struct window *window;
 	struct active_cell *cell;
 	uint32_t cells, triangles;
-	uint16_t *index; /* [VERTEX_NAMES] vertex of a name + 1, or 0: none so far */
+	uint16_t *index; /* [VERTEX_NAMES] vertex of a name + 1, or 0: none so far; rows without cells are not set */
 };
+
+static uint32_t own_active(const struct window *window, int j, int k)
+{
+	return (window->active[window_row(j, k)] & CELLS_OWN) >> WINDOW_LOW;
+}
+
+static uint32_t count_cells(const struct window *window)
+{
+	uint32_t n = 0;
+	for (int k = 0; k < PATCH_SIDE; k++)
+		for (int j = 0; j < PATCH_SIDE; j++)
+			for (uint32_t active = own_active(window, j, k); active; active &= active - 1)
+				n++;
+	return n;
+}
 
 static uint8_t case_triangles(uint8_t code)
 {
@@ -361,15 +392,26 @@ static void list_cells(struct extraction *x)
 {
 	for (int k = 0; k < PATCH_SIDE; k++)
 		for (int j = 0; j < PATCH_SIDE; j++) {
-			const uint32_t *in = &x->window->inside[row_at(j, k)];
+			const uint32_t *in = &x->window->inside[window_row(j, k)];
 			const uint32_t rows[4] = {in[0], in[1], in[WINDOW_SIDE], in[WINDOW_SIDE + 1]};
-			for (uint32_t active = x->window->active[k * PATCH_SIDE + j]; active; active &= active - 1) {
+			for (uint32_t active = own_active(x->window, j, k); active; active &= active - 1) {
 				int i = __builtin_ctz(active), b = i + WINDOW_LOW;
 				uint8_t code = (uint8_t)((rows[0] >> b & 3) | (rows[1] >> b & 3) << 2 |
 				                         (rows[2] >> b & 3) << 4 | (rows[3] >> b & 3) << 6);
-				x->cell[x->cells++] = (struct active_cell){(uint8_t)i, (uint8_t)j, (uint8_t)k, code};
+				x->cell[x->cells++] = (struct active_cell){(uint16_t)i, (uint16_t)j, (uint16_t)k, code};
 				x->triangles += case_triangles(code);
 			}
+		}
+}
+
+/* No vertex has a name yet, in the rows that cells will look at. */
+static void forget_names(const struct window *window, uint16_t *index)
+{
+	for (int k = 0; k <= PATCH_SIDE; k++)
+		for (int j = 0; j <= PATCH_SIDE; j++) {
+			const uint32_t *active = &window->active[window_row(j, k)];
+			if (active[0] | active[-1] | active[-WINDOW_SIDE] | active[-WINDOW_SIDE - 1])
+				memset(&index[vertex_name(0, j, k, 0)], 0, ROW_NAMES * sizeof *index);
 		}
 }
 
@@ -377,9 +419,18 @@ static void list_cells(struct extraction *x)
 static const uint8_t edge_corner[12][3] = {{0, 0, 0}, {0, 1, 0}, {0, 0, 1}, {0, 1, 1}, {0, 0, 0}, {1, 0, 0},
                                            {0, 0, 1}, {1, 0, 1}, {0, 0, 0}, {1, 0, 0}, {0, 1, 0}, {1, 1, 0}};
 
-static uint32_t make_vertex(struct extraction *x, struct surface *surface, const int at[3], int axis, uint32_t name)
+/* The name of edge e less that of the cell's own corner. */
+#define NAME(i, j, k, axis) ((((k)*CORNERS + (j)) * CORNERS + (i)) * 3 + (axis))
+static const uint16_t edge_name[12] = {NAME(0, 0, 0, 0), NAME(0, 1, 0, 0), NAME(0, 0, 1, 0), NAME(0, 1, 1, 0),
+                                       NAME(0, 0, 0, 1), NAME(1, 0, 0, 1), NAME(0, 0, 1, 1), NAME(1, 0, 1, 1),
+                                       NAME(0, 0, 0, 2), NAME(1, 0, 0, 2), NAME(0, 1, 0, 2), NAME(1, 1, 0, 2)};
+
+static uint32_t make_vertex(struct extraction *x, struct surface *surface, struct active_cell cell, int e,
+                            uint32_t name)
 {
 	static const int step[3] = {1, WINDOW_SIDE, WINDOW_SIDE * WINDOW_SIDE};
+	const int at[3] = {cell.i + edge_corner[e][0], cell.j + edge_corner[e][1], cell.k + edge_corner[e][2]};
+	const int axis = e >> 2;
 	const int16_t *value = &x->window->value[window_at(at[0], at[1], at[2])];
 	uint32_t v = surface->nv++;
 	for (int a = 0; a < 3; a++)
@@ -393,14 +444,11 @@ static uint32_t make_vertex(struct extraction *x, struct surface *surface, const
 static void extract_cell(struct extraction *x, struct surface *surface, struct active_cell cell)
 {
 	const int8_t *edge = cubes_triangles[cell.code];
+	const uint32_t own = vertex_name(cell.i, cell.j, cell.k, 0);
 	for (; *edge >= 0; edge += 3, surface->nt++)
 		for (int c = 0; c < 3; c++) {
-			int e = edge[c], axis = e >> 2;
-			int at[3] = {cell.i + edge_corner[e][0], cell.j + edge_corner[e][1],
-			             cell.k + edge_corner[e][2]};
-			uint32_t name = vertex_name(at[0], at[1], at[2], axis);
-			uint32_t v = x->index[name];
-			surface->triangle[surface->nt][c] = v ? v - 1 : make_vertex(x, surface, at, axis, name);
+			uint32_t name = own + edge_name[edge[c]], v = x->index[name];
+			surface->triangle[surface->nt][c] = v ? v - 1 : make_vertex(x, surface, cell, edge[c], name);
 		}
 }
 
@@ -409,10 +457,10 @@ static int reserve(struct extraction *x, struct arena *arena, struct surface *re
 {
 	uint32_t vertices = x->triangles * 3 < VERTEX_NAMES ? x->triangles * 3 : VERTEX_NAMES;
 	*ret = (struct surface){0};
-	ret->vertex = arena_alloc(arena, vertices, sizeof *ret->vertex);
-	ret->name = ARENA_NEW(arena, uint32_t, vertices);
-	ret->triangle = arena_alloc(arena, x->triangles, sizeof *ret->triangle);
-	x->index = ARENA_NEW(arena, uint16_t, VERTEX_NAMES);
+	ret->vertex = arena_take(arena, vertices, sizeof *ret->vertex);
+	ret->name = ARENA_TAKE(arena, uint32_t, vertices);
+	ret->triangle = arena_take(arena, x->triangles, sizeof *ret->triangle);
+	x->index = ARENA_TAKE(arena, uint16_t, VERTEX_NAMES);
 	if (!ret->vertex || !ret->name || !ret->triangle || !x->index)
 		return -ENOMEM;
 	return 0;
@@ -424,15 +472,14 @@ int cubes_extract(const struct window *window, struct arena *arena, struct surfa
 	struct extraction x = {.window = window};
 	struct surface surface = {0};
 	if (!window->empty) {
-		x.cell = ARENA_NEW(arena, struct active_cell, PATCH_SIDE * PATCH_SIDE * PATCH_SIDE);
+		x.cell = ARENA_TAKE(arena, struct active_cell, count_cells(window));
 		if (!x.cell)
 			return -ENOMEM;
 		list_cells(&x);
-	}
-	if (x.cells) {
 		int r = reserve(&x, arena, &surface);
 		if (r)
 			return r;
+		forget_names(window, x.index);
 	}
 	for (uint32_t c = 0; c < x.cells; c++)
 		extract_cell(&x, &surface, x.cell[c]);

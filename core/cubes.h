@@ -1,31 +1,34 @@
 /* Marching cubes on one patch (decision D6; thesis 3.2, lecture 004 E.5.3.6).
  *
- * gather  copies the published values of the corners [-2, 18] of a patch and fills unknown corners;
+ * gather  finds the cells with a surface among the published values of a patch, and fills unknown corners;
  * extract turns the cells [0, 16) into triangles on the lattice of 1/256 cell.
  * A vertex is named by (voxel, axis); its place depends on that voxel and its neighbour along the axis only. */
 #ifndef FACET_CORE_CUBES_H
 #define FACET_CORE_CUBES_H
 
 #include "core/arena.h"
+#include "core/digest.h"
 #include "core/grid.h"
 
 #define WINDOW_LOW    2                /* corners below the patch */
 #define WINDOW_SIDE   (PATCH_SIDE + 5) /* corners -2 .. 18 */
+#define WINDOW_ROWS   (WINDOW_SIDE * WINDOW_SIDE)
 #define WINDOW_VOXELS (WINDOW_SIDE * WINDOW_SIDE * WINDOW_SIDE)
 
-/* Corner values of a patch and its halo; index with window_at.
+/* What the surface of a patch and its border are made of. A cell is complete when its 8 corners are known; it has a
+ * surface when it is complete and its corners differ in sign. Rows: bit i + 2 of row (k + 2) * 21 + j + 2 is the corner,
+ * or the cell, i, j, k in patch coordinates.
  *
  * Fill: an unknown corner of -1 .. 17 with known neighbours on two or more axes, all of one sign, takes the value of the
- * largest magnitude among them (from unfilled values only). It is stored for corners of complete cells of both signs;
- * elsewhere the fill would change no mesh, and the corner stays unknown. */
+ * largest magnitude among them (from unfilled values only). */
 struct window {
 	struct patch_key key;
-	bool empty; /* no cell of the patch has a surface: nothing to extract, and the values mean nothing */
-	int16_t value[WINDOW_VOXELS]; /* 1/256 cell, VOXEL_UNKNOWN */
-	/* For cubes_extract: the patch's cells with a surface, bit i of row k * 16 + j; the inside corners after the fill, bit
-	 * i + 2 of row (k + 2) * 21 + j + 2. */
-	uint16_t active[PATCH_SIDE * PATCH_SIDE];
-	uint32_t inside[WINDOW_SIDE * WINDOW_SIDE];
+	bool empty;           /* no cell of the patch has a surface: nothing to extract, and the rest means nothing */
+	struct digest digest; /* equal: the surface and the border are the same, see cubes.c */
+	uint32_t active[WINDOW_ROWS]; /* cells with a surface: the patch's own, and those that share a face with it */
+	uint32_t inside[WINDOW_ROWS]; /* of the corners of these cells: behind a surface */
+	int16_t
+	    value[WINDOW_VOXELS]; /* 1/256 cell; only where an edge crosses the surface, elsewhere it means nothing */
 };
 
 static inline int window_at(int i, int j, int k) /* patch coordinates, -2 .. 18 */
@@ -39,9 +42,16 @@ static inline bool corner_inside(int16_t value)
 	return value < 0;
 }
 
-/* A cell is complete when its 8 corners are known. -1 .. 16 in each coordinate. Ask for cells of both signs only: for
- * others the answer depends on which of their filled corners were stored. */
-bool window_cell_complete(const struct window *, int i, int j, int k);
+static inline int window_row(int j, int k)
+{
+	return (k + WINDOW_LOW) * WINDOW_SIDE + j + WINDOW_LOW;
+}
+
+/* A cell of the patch (0 .. 15), or one that shares a face with it (-1 or 16 in one coordinate). */
+static inline bool window_active(const struct window *window, int i, int j, int k)
+{
+	return window->active[window_row(j, k)] >> (i + WINDOW_LOW) & 1;
+}
 
 #define PARAMETER_MIN 4 /* 1/64 of an edge */
 

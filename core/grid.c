@@ -141,7 +141,7 @@ static bool slab_reserve(struct grid *grid)
 	}
 	if (!room_for(grid, SLAB_BLOCKS * sizeof(struct block)))
 		return false;
-	grid->slab[grid->slabs] = malloc(SLAB_BLOCKS * sizeof(struct block));
+	grid->slab[grid->slabs] = aligned_alloc(_Alignof(struct block), SLAB_BLOCKS * sizeof(struct block));
 	if (!grid->slab[grid->slabs])
 		return false;
 	grid->slabs++;
@@ -191,6 +191,31 @@ struct block *grid_find(const struct grid *grid, struct block_key key)
 	const struct slot *slot = table_at(&grid->blocks, key.x, key.y, key.z);
 
 	return slot->value ? block_at(grid, slot->value - 1) : NULL;
+}
+
+/* One look-up waits for the next, and blocks lie anywhere: so first all of the table's lines are asked for, then the bits
+ * of all blocks, and the memory answers them together. */
+void grid_find_box(const struct grid *grid, struct block_key low,
+                   const struct block *ret_blocks[GRID_BOX_SIDE * GRID_BOX_SIDE * GRID_BOX_SIDE])
+{
+	enum { SIDE = GRID_BOX_SIDE, BLOCKS = SIDE * SIDE * SIDE };
+	const size_t mask = grid->blocks.slots - 1;
+
+	for (int n = 0; n < BLOCKS; n++) {
+		size_t hash = hash_of(low.x + n % SIDE, low.y + n / SIDE % SIDE, low.z + n / (SIDE * SIDE));
+
+		__builtin_prefetch(&grid->blocks.slot[hash & mask]);
+	}
+	for (int n = 0; n < BLOCKS; n++) {
+		struct block_key key = {low.x + n % SIDE, low.y + n / SIDE % SIDE, low.z + n / (SIDE * SIDE)};
+		const struct block *block = ret_blocks[n] = grid_find(grid, key);
+
+		if (block) {
+			__builtin_prefetch(block->known);
+			__builtin_prefetch(block->inside);
+			__builtin_prefetch(block->inside + BLOCK_SIDE - 1);
+		}
+	}
 }
 
 static bool patch_within(int32_t x, int32_t y, int32_t z)

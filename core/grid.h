@@ -42,7 +42,8 @@ struct block {
 	uint8_t layers[3]; /* kept by the field, as is `negative`: bit b where layer b along x, y, z has such a voxel */
 	uint64_t negative[BLOCK_SIDE]; /* bit y * 8 + x of word z: the sum is negative, so a ray may clear the voxel */
 	uint64_t known[BLOCK_SIDE], inside[BLOCK_SIDE]; /* as `negative`: published as known, as behind a surface */
-	struct voxel voxel[BLOCK_VOXELS];               /* index (z * 8 + y) * 8 + x */
+	_Alignas(64) struct voxel
+	    voxel[BLOCK_VOXELS]; /* a row of eight along x is one line of the cache; index (z * 8 + y) * 8 + x */
 };
 
 /* Sets the published value of a voxel, by its index, with its bits. */
@@ -65,6 +66,12 @@ void grid_destroy(struct grid *);
 
 /* NULL where there is none. */
 struct block *grid_find(const struct grid *, struct block_key);
+
+#define GRID_BOX_SIDE 4
+
+/* The blocks of a box from `low`, NULL where there are none; index (z * 4 + y) * 4 + x. */
+void grid_find_box(const struct grid *, struct block_key low,
+                   const struct block *ret_blocks[GRID_BOX_SIDE * GRID_BOX_SIDE * GRID_BOX_SIDE]);
 
 /* The block, made if absent; NULL beyond the limits (counted in grid_stats). */
 struct block *grid_touch(struct grid *, struct block_key);

@@ -7,6 +7,7 @@
 #include "core/map.h"
 
 #include <assert.h>
+#include <errno.h>
 #include <stdlib.h>
 #include <string.h>
 
@@ -37,7 +38,10 @@ struct map {
 struct mesher {
 	struct arena arena;
 	struct window window;
-	struct surface raw; /* of the window; in the arena */
+	const struct patch
+	    *before;        /* made of the same window, the memo's; NULL: there is none, and `raw` is the surface */
+	struct surface raw; /* in the arena */
+	uint32_t faces;     /* of the window's surface, before the reduction */
 	struct reduce_stats stats;
 	uint64_t faces_raw;
 };
@@ -206,10 +210,16 @@ int map_extract(const struct map *map, struct mesher *mesher, struct patch_key k
 	assert(map && mesher);
 	arena_reset(&mesher->arena);
 	cubes_gather(map->grid, key, &mesher->window);
-	int r = cubes_extract(&mesher->window, &mesher->arena, &mesher->raw);
-	if (r == 0)
-		mesher->faces_raw += mesher->raw.nt;
-	return r;
+	mesher->before = NULL;
+	if (map->params.reduce && !mesher->window.empty)
+		mesher->before = memo_recall(map->memo, key, mesher->window.digest, &mesher->faces);
+	if (!mesher->before) {
+		if (cubes_extract(&mesher->window, &mesher->arena, &mesher->raw))
+			return -ENOMEM;
+		mesher->faces = mesher->raw.nt;
+	}
+	mesher->faces_raw += mesher->faces;
+	return 0;
 }
 
 /* The patch of the mesher's surface, without version and times: remembered, or made and then remembered. */
@@ -221,23 +231,31 @@ static struct patch *reduce_or_recall(const struct map *map, struct mesher *mesh
 	struct surface surface;
 	if (reduce_border(&mesher->window, &mesher->raw, &params, &mesher->arena, &border))
 		return NULL;
-	struct digest digest = memo_digest(&mesher->raw, &border);
-	const struct patch *before = memo_find(map->memo, key, digest);
+	const struct memo_source source = {mesher->window.digest, memo_digest(&mesher->raw, &border), mesher->raw.nt};
+	const struct patch *before = memo_find(map->memo, key, &source);
 	if (before)
 		return patch_copy(before);
 	if (reduce_within(&border, &mesher->raw, &params, &mesher->arena, &mesher->stats, &surface))
 		return NULL;
 	struct patch *patch = patch_create(key, &surface);
 	if (patch)
-		memo_keep(map->memo, digest, patch);
+		memo_keep(map->memo, &source, patch);
 	return patch;
+}
+
+static struct patch *make_patch(const struct map *map, struct mesher *mesher)
+{
+	if (mesher->before)
+		return patch_copy(mesher->before);
+	if (map->params.reduce && mesher->raw.nt)
+		return reduce_or_recall(map, mesher);
+	return patch_create(mesher->window.key, &mesher->raw);
 }
 
 struct patch *map_reduce(const struct map *map, struct mesher *mesher)
 {
 	assert(map && mesher);
-	struct patch *patch = map->params.reduce && mesher->raw.nt ? reduce_or_recall(map, mesher)
-	                                                           : patch_create(mesher->window.key, &mesher->raw);
+	struct patch *patch = make_patch(map, mesher);
 	if (!patch)
 		return NULL;
 	const struct birth *birth = find_birth(map->birth, map->births_cap, patch->key);
@@ -253,6 +271,6 @@ struct patch *map_mesh_patch(const struct map *map, struct mesher *mesher, struc
 	if (map_extract(map, mesher, key))
 		return NULL;
 	if (ret_raw_faces)
-		*ret_raw_faces = mesher->raw.nt;
+		*ret_raw_faces = mesher->faces;
 	return map_reduce(map, mesher);
 }

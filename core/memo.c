@@ -1,15 +1,6 @@
-/* The digest is two multiplicative hashes of 64 bits side by side: it guards against chance, not against forgery. */
 #include "core/memo.h"
 
 #include <string.h>
-
-static void digest_word(struct digest *d, uint64_t word)
-{
-	d->a = (d->a ^ word) * 0x9fb21c651e98df25ull;
-	d->a ^= d->a >> 29;
-	d->b = (d->b + word) * 0xd6e8feb86659fd93ull;
-	d->b = d->b << 31 | d->b >> 33;
-}
 
 static void digest_bytes(struct digest *d, const void *bytes, size_t n)
 {
@@ -72,22 +63,38 @@ void memo_expect(struct memo *memo, const struct patch_key *keys, size_t n)
 	}
 }
 
-const struct patch *memo_find(const struct memo *memo, struct patch_key key, struct digest digest)
+static bool equal(struct digest x, struct digest y)
+{
+	return x.a == y.a && x.b == y.b;
+}
+
+const struct patch *memo_recall(const struct memo *memo, struct patch_key key, struct digest window,
+                                uint32_t *ret_faces_raw)
 {
 	const struct memo_slot *slot = &memo->slot[slot_of(key)];
-	if (!owns(slot, key) || slot->digest.a != digest.a || slot->digest.b != digest.b)
+	if (!owns(slot, key) || !slot->patch || !equal(slot->source.window, window))
 		return NULL;
+	*ret_faces_raw = slot->source.faces_raw;
 	return slot->patch;
 }
 
-void memo_keep(struct memo *memo, struct digest digest, struct patch *patch)
+const struct patch *memo_find(struct memo *memo, struct patch_key key, const struct memo_source *source)
+{
+	struct memo_slot *slot = &memo->slot[slot_of(key)];
+	if (!owns(slot, key) || !slot->patch || !equal(slot->source.surface, source->surface))
+		return NULL;
+	slot->source.window = source->window;
+	return slot->patch;
+}
+
+void memo_keep(struct memo *memo, const struct memo_source *source, struct patch *patch)
 {
 	struct memo_slot *slot = &memo->slot[slot_of(patch->key)];
 	if (!owns(slot, patch->key))
 		return;
 	patch_unref(slot->patch);
 	slot->patch = patch_bytes(patch) <= MEMO_BYTES_MAX ? patch_ref(patch) : NULL;
-	slot->digest = digest;
+	slot->source = *source;
 }
 
 void memo_finish(struct memo *memo)

@@ -104,16 +104,16 @@ static void copy_triangles(struct patch *patch, const struct surface *surface, c
 struct patch *patch_create(struct patch_key key, const struct surface *surface)
 {
 	assert(surface && surface->nv <= PATCH_VERTICES_MAX && surface->nt <= UINT16_MAX);
+	if (!surface->nt)
+		return patch_allocate(key, 0, 0, 0);
 	struct order *order = malloc((surface->nt + 1) * sizeof *order);
 	if (!order)
 		return NULL;
 	sort_triangles(surface, order);
-	uint32_t nv = surface->nt ? surface->nv : 0;
-	struct patch *patch = patch_allocate(key, nv, surface->nt, count_runs(order, surface->nt));
+	struct patch *patch = patch_allocate(key, surface->nv, surface->nt, count_runs(order, surface->nt));
 	if (patch) {
 		copy_triangles(patch, surface, order);
-		if (nv)
-			memcpy(patch->vertex, surface->vertex, nv * sizeof *patch->vertex);
+		memcpy(patch->vertex, surface->vertex, surface->nv * sizeof *patch->vertex);
 	}
 	free(order);
 	return patch;

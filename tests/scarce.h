@@ -25,6 +25,7 @@ static long scarce_left = -1; /* calls until memory is out once; -1: never */
 static long scarce_live;      /* blocks in use */
 
 void *__libc_malloc(size_t size);
+void *__libc_memalign(size_t alignment, size_t size);
 void *__libc_calloc(size_t n, size_t size);
 void *__libc_realloc(void *p, size_t size);
 void __libc_free(void *p);
@@ -37,6 +38,13 @@ static bool scarce_refuses(void)
 void *malloc(size_t size)
 {
 	void *p = scarce_refuses() ? NULL : __libc_malloc(size);
+	scarce_live += p != NULL;
+	return p;
+}
+
+void *aligned_alloc(size_t alignment, size_t size)
+{
+	void *p = scarce_refuses() ? NULL : __libc_memalign(alignment, size);
 	scarce_live += p != NULL;
 	return p;
 }

@@ -9,6 +9,7 @@
 #include <cmocka.h>
 
 #include "core/map.h"
+#include "core/memo.h"
 #include "tests/soup.h"
 
 #define ROWS  120
@@ -395,6 +396,102 @@ static void a_halo_one_voxel_too_small_leaves_stale_patches(void **state)
 	assert_int_equal(changed_from(3, 10), 0);
 }
 
+/* A patch of a map, made without anything remembered. */
+struct anew {
+	struct window window;
+	struct arena arena;
+	struct surface raw;
+	struct digest surface; /* of raw mesh and border */
+};
+
+static void extract_anew(struct anew *a, struct map *map, struct patch_key key)
+{
+	struct border border = {0};
+	arena_reset(&a->arena);
+	cubes_gather(map_grid(map), key, &a->window);
+	assert_int_equal(cubes_extract(&a->window, &a->arena, &a->raw), 0);
+	if (a->raw.nt)
+		assert_int_equal(border_find(&a->window, &a->raw, LATTICE / 4, &a->arena, &border), 0);
+	a->surface = memo_digest(&a->raw, &border);
+}
+
+static struct patch *mesh_anew(struct anew *a, struct map *map, struct patch_key key)
+{
+	const struct reduce_params params = {.tolerance = 0.25};
+	struct reduce_stats stats = {0};
+	struct surface reduced;
+	extract_anew(a, map, key);
+	assert_int_equal(reduce_surface(&a->window, &a->raw, &params, &a->arena, &stats, &reduced), 0);
+	return patch_create(key, &reduced);
+}
+
+/* Random changes of a half-unknown field, anywhere in patch 0,0,0 and its halo, and far more often than chance of values
+ * without effect: equal digests of windows must mean equal surfaces and borders. */
+static void windows_of_one_digest_have_one_surface_and_border(void **state)
+{
+	(void)state;
+	uint64_t random = 1147;
+	struct map *map = wandering_map(true, &random);
+	struct anew *a = calloc(1, sizeof *a);
+	struct digest window[REGION_KEYS], surface[REGION_KEYS];
+	int same = 0, changed = 0, found_later = 0;
+	for (int change = -1; change < 1500; change++) {
+		int at[3] = {0, 0, 0};
+		if (change >= 0)
+			change_voxel(map, &random, change, at);
+		for (int n = 0; n < REGION_KEYS; n++) {
+			if (change >= 0 && !near_corner(region_key(n), at, 4))
+				continue;
+			extract_anew(a, map, region_key(n));
+			if (change >= 0 && !a->window.empty && !memcmp(&window[n], &a->window.digest, sizeof *window)) {
+				assert_memory_equal(&surface[n], &a->surface, sizeof *surface);
+				same++;
+			} else if (change >= 0) {
+				changed += !!memcmp(&surface[n], &a->surface, sizeof *surface);
+				found_later += !memcmp(&surface[n], &a->surface, sizeof *surface);
+			}
+			window[n] = a->window.empty ? (struct digest){0, 0} : a->window.digest;
+			surface[n] = a->surface;
+		}
+	}
+	print_message("note: %d windows were the same, %d other; %d of one surface were told apart\n", same, changed,
+	              found_later);
+	assert_true(same > 1000 && changed > 200);
+	arena_finish(&a->arena);
+	free(a);
+	map_destroy(map);
+}
+
+/* Law L2: rows with noise, meshed one by one; every patch is made a second time without a memory. */
+static void what_a_map_remembers_is_what_it_would_make_again(void **state)
+{
+	(void)state;
+	struct map *map = make_map(true);
+	struct mesher *mesher = mesher_create();
+	struct anew *a = calloc(1, sizeof *a);
+	uint64_t faces = 0;
+	for (int row = 0; row < ROWS; row++) {
+		const struct patch_key *keys;
+		map_row(map, room_row(row));
+		size_t n = map_take_dirty(map, &keys);
+		for (size_t i = 0; i < n; i++) {
+			uint32_t faces_raw;
+			struct patch *patch = map_mesh_patch(map, mesher, keys[i], &faces_raw);
+			struct patch *again = mesh_anew(a, map, keys[i]);
+			assert_true(patch_equal(patch, again));
+			assert_int_equal(faces_raw, a->raw.nt);
+			faces += faces_raw;
+			patch_unref(patch);
+			patch_unref(again);
+		}
+	}
+	assert_int_equal(mesher_faces_raw(mesher), faces);
+	arena_finish(&a->arena);
+	free(a);
+	mesher_destroy(mesher);
+	map_destroy(map);
+}
+
 int main(void)
 {
 	const struct CMUnitTest tests[] = {
@@ -403,6 +500,8 @@ int main(void)
 	    cmocka_unit_test(a_patch_that_loses_its_surface_becomes_a_tombstone),
 	    cmocka_unit_test(the_patches_of_a_room_fit),
 	    cmocka_unit_test(raw_and_reduced_patches_that_are_not_dirty_have_not_changed),
+	    cmocka_unit_test(windows_of_one_digest_have_one_surface_and_border),
+	    cmocka_unit_test(what_a_map_remembers_is_what_it_would_make_again),
 	    cmocka_unit_test(a_halo_one_voxel_too_small_leaves_stale_patches),
 	};
 	return cmocka_run_group_tests(tests, NULL, NULL);

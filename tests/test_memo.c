@@ -25,11 +25,24 @@ static void forget(struct memo *memo)
 	free(memo);
 }
 
-static void keep(struct memo *memo, struct patch_key key, struct digest digest, uint32_t nt)
+/* Made of a surface with that digest and of a window with a digest of its own. */
+static struct memo_source source_of(struct digest surface)
+{
+	return (struct memo_source){.window = {surface.a + 100, surface.b}, .surface = surface, .faces_raw = 50};
+}
+
+static void keep(struct memo *memo, struct patch_key key, struct digest surface, uint32_t nt)
 {
 	struct patch *patch = patch_allocate(key, 3, nt, 1);
-	memo_keep(memo, digest, patch);
+	const struct memo_source source = source_of(surface);
+	memo_keep(memo, &source, patch);
 	patch_unref(patch);
+}
+
+static const struct patch *find(struct memo *memo, struct patch_key key, struct digest surface)
+{
+	const struct memo_source source = source_of(surface);
+	return memo_find(memo, key, &source);
 }
 
 static void a_patch_is_found_by_its_key_and_digest_only(void **state)
@@ -37,14 +50,36 @@ static void a_patch_is_found_by_its_key_and_digest_only(void **state)
 	(void)state;
 	struct memo *memo = memo_of(&one, 1);
 	struct digest digest = {1, 2};
-	assert_null(memo_find(memo, one, digest));
+	assert_null(find(memo, one, digest));
 	keep(memo, one, digest, 7);
-	const struct patch *found = memo_find(memo, one, digest);
+	const struct patch *found = find(memo, one, digest);
 	assert_non_null(found);
 	assert_int_equal(found->nt, 7);
-	assert_null(memo_find(memo, other, digest));
-	assert_null(memo_find(memo, one, (struct digest){1, 3}));
-	assert_null(memo_find(memo, one, (struct digest){2, 2}));
+	assert_null(find(memo, other, digest));
+	assert_null(find(memo, one, (struct digest){1, 3}));
+	assert_null(find(memo, one, (struct digest){2, 2}));
+	forget(memo);
+}
+
+static void a_patch_is_recalled_by_the_newest_window_that_gave_its_surface(void **state)
+{
+	(void)state;
+	struct memo *memo = memo_of(&one, 1);
+	const struct digest surface = {1, 2}, first = source_of(surface).window, second = {8, 9};
+	struct memo_source source = source_of(surface);
+	uint32_t faces = 0;
+	assert_null(memo_recall(memo, one, first, &faces));
+	keep(memo, one, surface, 7);
+	assert_null(memo_recall(memo, other, first, &faces));
+	assert_null(memo_recall(memo, one, second, &faces));
+	assert_int_equal(faces, 0);
+	const struct patch *patch = memo_recall(memo, one, first, &faces);
+	assert_int_equal(patch->nt, 7);
+	assert_int_equal(faces, 50);
+	source.window = second;
+	assert_ptr_equal(memo_find(memo, one, &source), patch);
+	assert_ptr_equal(memo_recall(memo, one, second, &faces), patch);
+	assert_null(memo_recall(memo, one, first, &faces));
 	forget(memo);
 }
 
@@ -53,7 +88,7 @@ static void a_key_that_nobody_expected_is_not_remembered(void **state)
 	(void)state;
 	struct memo *memo = memo_of(&one, 1);
 	keep(memo, other, (struct digest){1, 2}, 7);
-	assert_null(memo_find(memo, other, (struct digest){1, 2}));
+	assert_null(find(memo, other, (struct digest){1, 2}));
 	forget(memo);
 }
 
@@ -63,8 +98,8 @@ static void a_patch_too_large_replaces_the_old_one_by_none(void **state)
 	struct memo *memo = memo_of(&one, 1);
 	keep(memo, one, (struct digest){1, 2}, 7);
 	keep(memo, one, (struct digest){3, 4}, MEMO_BYTES_MAX / 12);
-	assert_null(memo_find(memo, one, (struct digest){1, 2}));
-	assert_null(memo_find(memo, one, (struct digest){3, 4}));
+	assert_null(find(memo, one, (struct digest){1, 2}));
+	assert_null(find(memo, one, (struct digest){3, 4}));
 	forget(memo);
 }
 
@@ -82,7 +117,7 @@ static void of_more_keys_than_slots_none_gets_the_patch_of_another(void **state)
 		for (int k = 0; k < KEYS; k++)
 			keep(memo, keys[k], (struct digest){1, 2}, 1);
 		for (int k = 0; k < KEYS; k++) {
-			const struct patch *found = memo_find(memo, keys[k], (struct digest){1, 2});
+			const struct patch *found = find(memo, keys[k], (struct digest){1, 2});
 			assert_true(!found || !patch_key_compare(found->key, keys[k]));
 			held += found != NULL;
 		}
@@ -119,6 +154,7 @@ int main(void)
 {
 	const struct CMUnitTest tests[] = {
 	    cmocka_unit_test(a_patch_is_found_by_its_key_and_digest_only),
+	    cmocka_unit_test(a_patch_is_recalled_by_the_newest_window_that_gave_its_surface),
 	    cmocka_unit_test(a_key_that_nobody_expected_is_not_remembered),
 	    cmocka_unit_test(a_patch_too_large_replaces_the_old_one_by_none),
 	    cmocka_unit_test(of_more_keys_than_slots_none_gets_the_patch_of_another),

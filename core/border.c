@@ -45,9 +45,21 @@ struct segment {
 	uint32_t chain, order; /* where it lies in its chain */
 };
 
+/* A vertex of the patch's surface on a face. */
+struct entry {
+	uint32_t vertex;
+	uint16_t node;
+};
+
+#define NODE_WORDS ((NODES + 63) / 64)
+
 struct face {
 	const struct window *window;
-	int axis, high, in[2]; /* the axes within the face, ascending */
+	int axis, high, in[2];     /* the axes within the face, ascending */
+	uint32_t inside[SIDE + 1]; /* bit p of row q: the corner is */
+	uint32_t own[SIDE],
+	    foreign[SIDE]; /* the same for squares: the cell of this patch, and that behind it, has a surface */
+	uint64_t crossed[NODE_WORDS]; /* nodes in use; the others hold nothing */
 	struct node node[NODES];
 	struct segment segment[SEGMENTS];
 	uint32_t segments;
@@ -74,44 +86,59 @@ static void node_where(int node, int *ret_direction, int *ret_p, int *ret_q)
 	*ret_q = index / width;
 }
 
-static const int16_t *corner(const struct face *face, int p, int q)
+/* The signs at the face, and the cells on its two sides. */
+static void look_at(struct face *face)
 {
-	int at[3];
-	at[face->axis] = face->high ? SIDE : 0;
-	at[face->in[0]] = p;
-	at[face->in[1]] = q;
-	return &face->window->value[window_at(at[0], at[1], at[2])];
+	const uint32_t *inside = face->window->inside, *active = face->window->active;
+	const int corner = face->high ? SIDE : 0, own = face->high ? SIDE - 1 : 0, foreign = face->high ? SIDE : -1;
+	memset(face->inside, 0, sizeof face->inside);
+	memset(face->own, 0, sizeof face->own);
+	memset(face->foreign, 0, sizeof face->foreign);
+	for (int q = 0; q <= SIDE; q++) {
+		if (face->axis) {
+			const bool z = face->axis == 2;
+			face->inside[q] = inside[z ? window_row(q, corner) : window_row(corner, q)] >> WINDOW_LOW;
+			if (q == SIDE)
+				continue;
+			face->own[q] = active[z ? window_row(q, own) : window_row(own, q)] >> WINDOW_LOW;
+			face->foreign[q] = active[z ? window_row(q, foreign) : window_row(foreign, q)] >> WINDOW_LOW;
+			continue;
+		}
+		for (int p = 0; p <= SIDE; p++)
+			face->inside[q] |= (inside[window_row(p, q)] >> (corner + WINDOW_LOW) & 1) << p;
+		for (int p = 0; p < SIDE && q < SIDE; p++) {
+			const uint32_t cells = active[window_row(p, q)];
+			face->own[q] |= (cells >> (own + WINDOW_LOW) & 1) << p;
+			face->foreign[q] |= (cells >> (foreign + WINDOW_LOW) & 1) << p;
+		}
+	}
 }
 
-static bool inside(const struct face *face, int p, int q)
-{
-	int at[3];
-	at[face->axis] = face->high ? SIDE : 0;
-	at[face->in[0]] = p;
-	at[face->in[1]] = q;
-	return face->window->inside[window_row(at[1], at[2])] >> (at[0] + WINDOW_LOW) & 1;
-}
-
-/* Whether the cell of this patch, or that behind the face, is complete; asked where the square's corners differ only. */
-static bool cell_complete(const struct face *face, int p, int q, bool own)
-{
-	int at[3];
-	at[face->axis] = face->high ? (own ? SIDE - 1 : SIDE) : (own ? 0 : -1);
-	at[face->in[0]] = p;
-	at[face->in[1]] = q;
-	return window_active(face->window, at[0], at[1], at[2]);
-}
-
+/* Where the surface crosses a grid edge of the face. */
 static void place_node(struct face *face, int node)
 {
 	static const int stride[3] = {1, WINDOW_SIDE, WINDOW_SIDE * WINDOW_SIDE};
-	int direction, p, q;
+	int direction, p, q, at[3];
 	node_where(node, &direction, &p, &q);
-	const int16_t *value = corner(face, p, q);
+	at[face->axis] = face->high ? SIDE : 0;
+	at[face->in[0]] = p;
+	at[face->in[1]] = q;
+	const int16_t *value = &face->window->value[window_at(at[0], at[1], at[2])];
 	int32_t *place = face->node[node].place;
 	place[0] = p * LATTICE;
 	place[1] = q * LATTICE;
 	place[direction] += cubes_edge_parameter(value[0], value[stride[face->in[direction]]]);
+}
+
+static struct node *use_node(struct face *face, int node, uint32_t vertex)
+{
+	uint64_t *word = &face->crossed[node >> 6], bit = 1ull << (node & 63);
+	if (!(*word & bit)) {
+		*word |= bit;
+		face->node[node] = (struct node){.vertex = vertex, .link = {NO_SEGMENT, NO_SEGMENT}};
+		place_node(face, node);
+	}
+	return &face->node[node];
 }
 
 static void add_segment(struct face *face, int a, int b, bool shared, bool foreign)
@@ -119,29 +146,24 @@ static void add_segment(struct face *face, int a, int b, bool shared, bool forei
 	uint16_t s = (uint16_t)face->segments++;
 	face->segment[s] = (struct segment){{(uint16_t)a, (uint16_t)b}, shared, NO_CHAIN, 0};
 	for (int k = 0; k < 2; k++) {
-		struct node *node = &face->node[face->segment[s].node[k]];
-		place_node(face, face->segment[s].node[k]);
+		struct node *node = use_node(face, k ? b : a, UINT32_MAX);
 		node->foreign |= foreign;
 		if (shared)
 			node->link[node->shared++] = s;
 	}
 }
 
-/* The segments of one square: two crossed edges joined, or the negative corners cut off. */
+/* The segments of one square whose corners differ: two crossed edges joined, or the negative corners cut off. */
 static void draw_square(struct face *face, int p, int q)
 {
-	bool s00 = inside(face, p, q), s10 = inside(face, p + 1, q);
-	bool s01 = inside(face, p, q + 1), s11 = inside(face, p + 1, q + 1);
-	if (s00 == s10 && s00 == s01 && s00 == s11)
-		return;
-	bool own = cell_complete(face, p, q, true), foreign = cell_complete(face, p, q, false);
-	if (!own && !foreign)
-		return;
+	bool s00 = face->inside[q] >> p & 1, s10 = face->inside[q] >> (p + 1) & 1;
+	bool s01 = face->inside[q + 1] >> p & 1, s11 = face->inside[q + 1] >> (p + 1) & 1;
+	bool foreign = face->foreign[q] >> p & 1, shared = foreign && face->own[q] >> p & 1;
 	int bottom = node_at(0, p, q), top = node_at(0, p, q + 1), left = node_at(1, p, q),
 	    right = node_at(1, p + 1, q);
 	if (s00 == s11 && s10 == s01) {
-		add_segment(face, bottom, s00 ? left : right, own && foreign, foreign);
-		add_segment(face, top, s00 ? right : left, own && foreign, foreign);
+		add_segment(face, bottom, s00 ? left : right, shared, foreign);
+		add_segment(face, top, s00 ? right : left, shared, foreign);
 		return;
 	}
 	int crossed[4], n = 0;
@@ -153,18 +175,24 @@ static void draw_square(struct face *face, int p, int q)
 		crossed[n++] = right;
 	if (s01 != s11)
 		crossed[n++] = top;
-	add_segment(face, crossed[0], crossed[1], own && foreign, foreign);
+	add_segment(face, crossed[0], crossed[1], shared, foreign);
 }
 
-/* `vertex` is that of the nodes of this face. */
-static void draw_face(struct face *face, const uint32_t *vertex)
+/* `entry` are the vertices on this face. A cell beside a square whose corners differ is complete if it has a surface. */
+static void draw_face(struct face *face, const struct entry *entry, uint32_t entries)
 {
 	face->segments = 0;
-	for (int n = 0; n < NODES; n++)
-		face->node[n] = (struct node){.vertex = vertex[n], .link = {NO_SEGMENT, NO_SEGMENT}};
-	for (int q = 0; q < SIDE; q++)
-		for (int p = 0; p < SIDE; p++)
-			draw_square(face, p, q);
+	memset(face->crossed, 0, sizeof face->crossed);
+	look_at(face);
+	for (uint32_t e = 0; e < entries; e++)
+		use_node(face, entry[e].node, entry[e].vertex);
+	for (int q = 0; q < SIDE; q++) {
+		uint32_t a = face->inside[q], b = face->inside[q + 1];
+		uint32_t differ = (a | a >> 1 | b | b >> 1) & ~(a & a >> 1 & b & b >> 1);
+		uint32_t squares = differ & (face->own[q] | face->foreign[q]) & ((1u << SIDE) - 1);
+		for (; squares; squares &= squares - 1)
+			draw_square(face, __builtin_ctz(squares), q);
+	}
 }
 
 static uint16_t other_end(const struct face *face, uint16_t segment, uint16_t node)
@@ -211,11 +239,25 @@ static bool step_touches(const struct face *face, uint16_t a, uint16_t b, const 
 	return segments_touch(pa, pb, face->node[c].place, face->node[d].place);
 }
 
+/* Whether the boxes of a-b and c-d have no point in common; then nor do the segments. */
+static bool apart(const int32_t a[2], const int32_t b[2], const int32_t c[2], const int32_t d[2])
+{
+	bool beyond = false;
+	for (int k = 0; k < 2; k++) {
+		const int32_t low = a[k] < b[k] ? a[k] : b[k], high = a[k] < b[k] ? b[k] : a[k];
+		beyond |= ((c[k] < low) & (d[k] < low)) | ((c[k] > high) & (d[k] > high));
+	}
+	return beyond;
+}
+
 static bool step_blocked(const struct face *face, const struct run *run, uint32_t i, uint32_t j)
 {
+	const int32_t *a = face->node[run->node[i]].place, *b = face->node[run->node[j]].place;
 	for (uint32_t s = 0; s < face->segments; s++) {
 		const struct segment *segment = &face->segment[s];
 		if (segment->chain == run->chain && segment->order >= i && segment->order < j)
+			continue;
+		if (apart(a, b, face->node[segment->node[0]].place, face->node[segment->node[1]].place))
 			continue;
 		if (step_touches(face, run->node[i], run->node[j], segment))
 			return true;
@@ -341,34 +383,40 @@ static void add_chain(const struct face *face, const struct run *run, bool close
 	}
 }
 
-static void trace_chains(struct face *face, struct border *border)
+static void trace_chain(struct face *face, uint16_t n, bool closed, struct border *border)
 {
 	struct run run;
-	for (int closed = 0; closed < 2; closed++)
-		for (uint16_t n = 0; n < NODES; n++) {
-			const struct node *node = &face->node[n];
-			if (node->shared != 1 + closed || face->segment[node->link[0]].chain != NO_CHAIN)
-				continue;
-			uint16_t first = node->link[0];
-			if (closed && other_end(face, node->link[1], n) < other_end(face, first, n))
-				first = node->link[1];
-			run.chain = border->chains;
-			follow(face, n, first, &run);
-			if (closed)
-				divide_closed(face, &run);
-			else
-				divide_open(face, &run);
-			add_chain(face, &run, closed, border);
-		}
+	const struct node *node = &face->node[n];
+	uint16_t first = node->link[0];
+	if (closed && other_end(face, node->link[1], n) < other_end(face, first, n))
+		first = node->link[1];
+	run.chain = border->chains;
+	follow(face, n, first, &run);
+	if (closed)
+		divide_closed(face, &run);
+	else
+		divide_open(face, &run);
+	add_chain(face, &run, closed, border);
 }
 
-static void judge_vertices(const struct face *face, struct border *border)
+/* From the ends of open chains first, then from what is left, in the order of nodes. */
+static void trace_chains(struct face *face, struct border *border)
 {
-	for (int n = 0; n < NODES; n++) {
-		const struct node *node = &face->node[n];
-		if (node->vertex == UINT32_MAX)
-			continue;
-		uint8_t bits = border->faces[node->vertex], *kind = &border->kind[node->vertex];
+	for (int closed = 0; closed < 2; closed++)
+		for (int w = 0; w < NODE_WORDS; w++)
+			for (uint64_t bits = face->crossed[w]; bits; bits &= bits - 1) {
+				int n = 64 * w + __builtin_ctzll(bits);
+				const struct node *node = &face->node[n];
+				if (node->shared == 1 + closed && face->segment[node->link[0]].chain == NO_CHAIN)
+					trace_chain(face, (uint16_t)n, closed, border);
+			}
+}
+
+static void judge_vertices(const struct face *face, const struct entry *entry, uint32_t entries, struct border *border)
+{
+	for (uint32_t e = 0; e < entries; e++) {
+		const struct node *node = &face->node[entry[e].node];
+		uint8_t bits = border->faces[entry[e].vertex], *kind = &border->kind[entry[e].vertex];
 		if (bits & (bits - 1))
 			*kind = BORDER_PINNED;
 		else if (node->shared == 2)
@@ -378,22 +426,49 @@ static void judge_vertices(const struct face *face, struct border *border)
 	}
 }
 
-/* Enters a vertex at the nodes of the faces it lies on. Returns on how many. */
-static uint32_t enter_vertex(uint32_t v, uint32_t name, uint32_t (*vertex)[NODES], uint8_t *ret_faces)
+/* The faces a vertex lies on. Along its own axis it never lies on one. */
+static uint8_t faces_of(const uint16_t vertex[3])
+{
+	uint8_t faces = 0;
+	for (int axis = 0; axis < 3; axis++)
+		faces |=
+		    (uint8_t)((vertex[axis] == 0) << 2 * axis | (vertex[axis] == SIDE * LATTICE) << (2 * axis + 1));
+	return faces;
+}
+
+static uint16_t node_of(uint32_t name, int axis)
 {
 	const int corners = SIDE + 1, along = (int)(name % 3), index = (int)(name / 3);
 	const int at[3] = {index % corners, index / corners % corners, index / corners / corners};
-	uint32_t n = 0;
-	*ret_faces = 0;
-	for (int axis = 0; axis < 3; axis++) {
-		if (axis == along || (at[axis] != 0 && at[axis] != SIDE))
-			continue;
-		int face = 2 * axis + (at[axis] == SIDE), in0 = axis == 0, in1 = axis == 2 ? 1 : 2;
-		vertex[face][node_at(along == in1, at[in0], at[in1])] = v;
-		*ret_faces |= (uint8_t)(1 << face);
-		n++;
+	const int in0 = axis == 0, in1 = axis == 2 ? 1 : 2;
+	return (uint16_t)node_at(along == in1, at[in0], at[in1]);
+}
+
+/* Lists the vertices of each face, one face after the other; `ret_entry` has room for two each. */
+static void enter_vertices(const struct surface *raw, const uint8_t *faces, const uint32_t first[6],
+                           struct entry *ret_entry)
+{
+	uint32_t at[6];
+	memcpy(at, first, sizeof at);
+	for (uint32_t v = 0; v < raw->nv; v++)
+		for (uint32_t bits = faces[v]; bits; bits &= bits - 1) {
+			int f = __builtin_ctz(bits);
+			ret_entry[at[f]++] = (struct entry){v, node_of(raw->name[v], f >> 1)};
+		}
+}
+
+/* Where each face's vertices begin in the list of all, and the end. */
+static void count_vertices(const struct surface *raw, uint8_t *ret_faces, uint32_t ret_first[7])
+{
+	uint32_t count[6] = {0};
+	for (uint32_t v = 0; v < raw->nv; v++) {
+		ret_faces[v] = faces_of(raw->vertex[v]);
+		for (uint32_t bits = ret_faces[v]; bits; bits &= bits - 1)
+			count[__builtin_ctz(bits)]++;
 	}
-	return n;
+	ret_first[0] = 0;
+	for (int f = 0; f < 6; f++)
+		ret_first[f + 1] = ret_first[f] + count[f];
 }
 
 int border_find(const struct window *window, const struct surface *raw, int64_t tolerance, struct arena *arena,
@@ -401,36 +476,34 @@ int border_find(const struct window *window, const struct surface *raw, int64_t 
 {
 	assert((raw->name || !raw->nv) && tolerance >= 0);
 	struct border border = {0};
-	uint32_t(*vertex)[NODES] = arena_alloc(arena, 6, sizeof *vertex);
-	struct face *face = ARENA_NEW(arena, struct face, 1);
+	uint32_t first[7];
+	struct face *face = ARENA_TAKE(arena, struct face, 1);
 	border.kind = ARENA_NEW(arena, uint8_t, raw->nv);
-	border.faces = ARENA_NEW(arena, uint8_t, raw->nv);
-	if (!vertex || !face || !border.kind || !border.faces)
+	border.faces = ARENA_TAKE(arena, uint8_t, raw->nv);
+	if (!face || !border.kind || !border.faces)
 		return -ENOMEM;
-	memset(vertex, 0xff, 6 * sizeof *vertex);
-	uint32_t nodes = 0;
-	uint8_t used = 0;
-	for (uint32_t v = 0; v < raw->nv; v++) {
-		nodes += enter_vertex(v, raw->name[v], vertex, &border.faces[v]);
-		used |= border.faces[v];
-	}
-	border.member = ARENA_NEW(arena, uint32_t, nodes + 1);
-	border.kept = ARENA_NEW(arena, bool, nodes + 1);
-	border.chain = ARENA_NEW(arena, struct border_chain, nodes + 1);
-	if (!border.member || !border.kept || !border.chain)
+	count_vertices(raw, border.faces, first);
+	const uint32_t nodes = first[6];
+	struct entry *entry = ARENA_TAKE(arena, struct entry, nodes);
+	border.member = ARENA_TAKE(arena, uint32_t, nodes + 1);
+	border.kept = ARENA_TAKE(arena, bool, nodes + 1);
+	border.chain = ARENA_TAKE(arena, struct border_chain, nodes + 1);
+	if (!entry || !border.member || !border.kept || !border.chain)
 		return -ENOMEM;
+	enter_vertices(raw, border.faces, first, entry);
 	face->window = window;
 	face->tolerance_squared = tolerance * tolerance;
 	for (int f = 0; f < 6; f++) {
-		if (!(used >> f & 1))
+		const uint32_t entries = first[f + 1] - first[f];
+		if (!entries)
 			continue;
 		face->axis = f >> 1;
 		face->high = f & 1;
 		face->in[0] = face->axis == 0;
 		face->in[1] = face->axis == 2 ? 1 : 2;
-		draw_face(face, vertex[f]);
+		draw_face(face, entry + first[f], entries);
 		trace_chains(face, &border);
-		judge_vertices(face, &border);
+		judge_vertices(face, entry + first[f], entries, &border);
 	}
 	*ret = border;
 	return 0;

@@ -11,6 +11,7 @@
 
 #include <assert.h>
 #include <errno.h>
+#include <string.h>
 
 static void unlist(struct halfedge_mesh *mesh, uint32_t h)
 {
@@ -132,19 +133,57 @@ static int reserve(const struct surface *surface, uint32_t spare, struct arena *
 {
 	uint32_t cap_nt = surface->nt + spare;
 	*ret = (struct halfedge_mesh){.nv = surface->nv, .cap_nt = cap_nt};
-	ret->position = arena_alloc(arena, surface->nv, sizeof *ret->position);
-	ret->first = ARENA_NEW(arena, uint32_t, surface->nv);
+	ret->position = arena_take(arena, surface->nv, sizeof *ret->position);
+	ret->first = ARENA_TAKE(arena, uint32_t, surface->nv);
 	ret->mark = ARENA_NEW(arena, uint32_t, surface->nv);
-	ret->origin = ARENA_NEW(arena, uint32_t, 3 * (size_t)cap_nt);
-	ret->twin = ARENA_NEW(arena, uint32_t, 3 * (size_t)cap_nt);
-	ret->next_leaving = ARENA_NEW(arena, uint32_t, 3 * (size_t)cap_nt);
+	ret->origin = ARENA_TAKE(arena, uint32_t, 3 * (size_t)cap_nt);
+	ret->twin = ARENA_TAKE(arena, uint32_t, 3 * (size_t)cap_nt);
+	ret->next_leaving = ARENA_TAKE(arena, uint32_t, 3 * (size_t)cap_nt);
 	return ret->position && ret->first && ret->mark && ret->origin && ret->twin && ret->next_leaving ? 0 : -ENOMEM;
+}
+
+/* Edges while a mesh is built: under the lower end of each the half-edge that brought it. */
+struct edges {
+	uint32_t *first; /* [nv] half-edge */
+	uint32_t *chain; /* [3 nt] next one with the same lower end */
+	uint32_t *upper; /* [3 nt] */
+};
+
+static int edges_make(const struct surface *surface, struct arena *arena, struct edges *ret)
+{
+	ret->first = ARENA_TAKE(arena, uint32_t, surface->nv);
+	ret->chain = ARENA_TAKE(arena, uint32_t, 3 * (size_t)surface->nt);
+	ret->upper = ARENA_TAKE(arena, uint32_t, 3 * (size_t)surface->nt);
+	if (!ret->first || !ret->chain || !ret->upper)
+		return -ENOMEM;
+	memset(ret->first, 0xff, surface->nv * sizeof *ret->first);
+	return 0;
+}
+
+/* Pairs h, which runs from a to b, with its twin if that came before. */
+static int pair(struct halfedge_mesh *mesh, struct edges *edges, uint32_t h, uint32_t a, uint32_t b)
+{
+	uint32_t lower = a < b ? a : b, upper = a < b ? b : a, e = edges->first[lower];
+	while (e != HALFEDGE_NONE && edges->upper[e] != upper)
+		e = edges->chain[e];
+	if (e != HALFEDGE_NONE && (mesh->origin[e] == a || mesh->twin[e] != HALFEDGE_NONE))
+		return -EINVAL;
+	join(mesh, h, e);
+	if (e == HALFEDGE_NONE) {
+		edges->upper[h] = upper;
+		edges->chain[h] = edges->first[lower];
+		edges->first[lower] = h;
+	}
+	return 0;
 }
 
 int halfedge_build(const struct surface *surface, uint32_t spare, struct arena *arena, struct halfedge_mesh *ret)
 {
 	struct halfedge_mesh mesh;
+	struct edges edges;
 	int r = reserve(surface, spare, arena, &mesh);
+	if (!r)
+		r = edges_make(surface, arena, &edges);
 	if (r)
 		return r;
 	for (uint32_t v = 0; v < mesh.nv; v++) {
@@ -152,14 +191,18 @@ int halfedge_build(const struct surface *surface, uint32_t spare, struct arena *
 		for (int axis = 0; axis < 3; axis++)
 			mesh.position[v][axis] = surface->vertex[v][axis];
 	}
+	mesh.nt = surface->nt;
 	for (uint32_t t = 0; t < surface->nt; t++) {
 		const uint32_t *corner = surface->triangle[t];
 		for (uint32_t k = 0; k < 3; k++) {
-			uint32_t a = corner[k], b = corner[(k + 1) % 3];
-			if (a == b || a >= mesh.nv || b >= mesh.nv || halfedge_find(&mesh, a, b) != HALFEDGE_NONE)
+			uint32_t a = corner[k], b = corner[k == 2 ? 0 : k + 1];
+			if (a == b || a >= mesh.nv || b >= mesh.nv)
+				return -EINVAL;
+			mesh.origin[3 * t + k] = a;
+			enlist(&mesh, 3 * t + k);
+			if (pair(&mesh, &edges, 3 * t + k, a, b))
 				return -EINVAL;
 		}
-		halfedge_add(&mesh, t, corner[0], corner[1], corner[2]);
 	}
 	*ret = mesh;
 	return 0;

@@ -50,6 +50,7 @@ struct grower {
 	struct turn *turn;       /* [nt] */
 	uint32_t *region;        /* [cap_nt] number, or NONE */
 	uint32_t *taken, n;      /* triangles of the region that grows */
+	uint8_t *entry;          /* which of their half-edges the region came over */
 	uint32_t *vertex, nv;    /* its vertices */
 	uint32_t *seen, stamp;   /* [nv] */
 	int32_t (*projected)[2]; /* [nv] vertices of the region in its plane */
@@ -188,34 +189,45 @@ static void take_vertex(struct grower *g, uint32_t v)
 	g->vertex[g->nv++] = v;
 }
 
-static void take(struct grower *g, uint32_t t, uint32_t number)
+/* The triangle of h, reached over h. */
+static void take(struct grower *g, uint32_t h, uint32_t number)
 {
-	g->region[t] = number;
-	g->taken[g->n++] = t;
+	g->region[h / 3] = number;
+	g->entry[g->n] = h % 3;
+	g->taken[g->n++] = h / 3;
 }
 
-/* From triangle `from`, which fits. Of a neighbour only the far corner is new; one seen before lies in the slab. */
-static void grow(struct grower *g, uint32_t from, uint32_t number)
+/* Takes the neighbour beyond h if it fits. Of its corners only the far one is new; one seen before lies in the slab. */
+static void try_beyond(struct grower *g, uint32_t h, uint32_t number)
 {
 	const struct halfedge_mesh *mesh = &g->s->mesh;
+	uint32_t twin = mesh->twin[h];
+	if (twin == HALFEDGE_NONE || !turned_alike(g, twin / 3))
+		return;
+	uint32_t far = mesh->origin[halfedge_previous(twin)];
+	if (g->seen[far] != g->stamp) {
+		if (!in_slab(g, far))
+			return;
+		take_vertex(g, far);
+	}
+	take(g, twin, number);
+}
+
+/* From triangle `from`, which fits. */
+static void grow(struct grower *g, uint32_t from, uint32_t number)
+{
 	g->n = g->nv = 0;
 	g->stamp++;
-	take(g, from, number);
-	for (int k = 0; k < 3; k++)
-		take_vertex(g, mesh->origin[3 * from + k]);
-	for (uint32_t k = 0; k < g->n; k++)
-		for (uint32_t h = 3 * g->taken[k]; h < 3 * g->taken[k] + 3; h++) {
-			uint32_t twin = mesh->twin[h];
-			if (twin == HALFEDGE_NONE || !turned_alike(g, twin / 3))
-				continue;
-			uint32_t far = mesh->origin[halfedge_previous(twin)];
-			if (g->seen[far] != g->stamp) {
-				if (!in_slab(g, far))
-					continue;
-				take_vertex(g, far);
-			}
-			take(g, twin / 3, number);
-		}
+	take(g, 3 * from, number);
+	for (uint32_t k = 0; k < 3; k++)
+		take_vertex(g, g->s->mesh.origin[3 * from + k]);
+	for (uint32_t h = 3 * from; h < 3 * from + 3; h++)
+		try_beyond(g, h, number);
+	for (uint32_t k = 1; k < g->n; k++) {
+		uint32_t h = 3 * g->taken[k], entry = g->entry[k];
+		try_beyond(g, entry == 0 ? h + 1 : h, number);
+		try_beyond(g, entry == 2 ? h + 1 : h + 2, number);
+	}
 }
 
 static void let_go(struct grower *g)
@@ -456,19 +468,13 @@ static int hand_over_all(struct grower *g, uint32_t n)
 	return 0;
 }
 
-static void restore(struct grower *g, uint32_t (*before)[3])
-{
-	for (uint32_t k = 0; k < g->n; k++) {
-		if (halfedge_alive(&g->s->mesh, g->taken[k]))
-			halfedge_remove(&g->s->mesh, g->taken[k]);
-		g->s->points[g->taken[k]] = UINT32_MAX;
-	}
-	for (uint32_t k = 0; k < g->n; k++)
-		halfedge_add(&g->s->mesh, g->taken[k], before[k][0], before[k][1], before[k][2]);
-}
+/* A triangle as it was: half-edges' origins and twins. */
+struct former {
+	uint32_t origin[3], twin[3];
+};
 
 /* Takes the triangles of the region out of the mesh: as halfedge_remove does one by one, but walks each list once. */
-static void remove_all(struct grower *g, uint32_t number)
+static void remove_all(struct grower *g, uint32_t number, struct former *ret)
 {
 	struct halfedge_mesh *mesh = &g->s->mesh;
 	for (uint32_t k = 0; k < g->nv; k++) {
@@ -480,11 +486,38 @@ static void remove_all(struct grower *g, uint32_t number)
 			}
 		*link = HALFEDGE_NONE;
 	}
+	for (uint32_t k = 0; k < g->n; k++) {
+		uint32_t *origin = &mesh->origin[3 * g->taken[k]], *twin = &mesh->twin[3 * g->taken[k]];
+		memcpy(ret[k].origin, origin, sizeof ret[k].origin);
+		memcpy(ret[k].twin, twin, sizeof ret[k].twin);
+	}
 	for (uint32_t k = 0; k < g->n; k++)
 		for (uint32_t h = 3 * g->taken[k]; h < 3 * g->taken[k] + 3; h++) {
 			if (mesh->twin[h] != HALFEDGE_NONE)
 				mesh->twin[mesh->twin[h]] = HALFEDGE_NONE;
 			mesh->origin[h] = mesh->twin[h] = HALFEDGE_NONE;
+		}
+}
+
+/* Puts them back as halfedge_add does one by one, but knows their twins. */
+static void restore(struct grower *g, const struct former *former)
+{
+	struct halfedge_mesh *mesh = &g->s->mesh;
+	for (uint32_t k = 0; k < g->n; k++) {
+		if (halfedge_alive(mesh, g->taken[k]))
+			halfedge_remove(mesh, g->taken[k]);
+		g->s->points[g->taken[k]] = UINT32_MAX;
+	}
+	for (uint32_t k = 0; k < g->n; k++)
+		for (uint32_t corner = 0; corner < 3; corner++) {
+			uint32_t h = 3 * g->taken[k] + corner, v = former[k].origin[corner],
+			         twin = former[k].twin[corner];
+			mesh->origin[h] = v;
+			mesh->next_leaving[h] = mesh->first[v];
+			mesh->first[v] = h;
+			mesh->twin[h] = twin;
+			if (twin != HALFEDGE_NONE)
+				mesh->twin[twin] = h;
 		}
 }
 
@@ -511,22 +544,21 @@ static int flatten(struct grower *g, uint32_t number)
 		return r;
 	project_vertices(g);
 	outline.point = arena_take(g->arena, outline.contour.n, sizeof *outline.point);
-	uint32_t(*before)[3] = arena_take(g->arena, g->n, sizeof *before), (*triangle)[3], n;
-	if (!outline.point || !before)
+	struct former *former = ARENA_TAKE(g->arena, struct former, g->n);
+	uint32_t(*triangle)[3], n;
+	if (!outline.point || !former)
 		return -ENOMEM;
 	place_outline(&outline);
 	if (!order_loops(&outline, g->arena) || outline.contour.n < 4)
 		return -EDOM;
-	for (uint32_t k = 0; k < g->n; k++)
-		memcpy(before[k], &mesh->origin[3 * g->taken[k]], sizeof before[k]);
-	remove_all(g, number);
+	remove_all(g, number, former);
 	const struct polygon polygon = {(const int32_t(*)[2])outline.point, outline.contour.loop_end, outline.contour.n,
 	                                outline.contour.loops};
 	r = triangulate(&polygon, allows, &outline, g->arena, &triangle, &n);
 	if (!r)
 		r = replace(g, &outline, triangle, n);
 	if (r)
-		restore(g, before);
+		restore(g, former);
 	return r;
 }
 
@@ -668,13 +700,14 @@ static int prepare(struct grower *g, struct simplify *s, struct arena *arena)
 	g->turn = ARENA_TAKE(arena, struct turn, mesh->nt);
 	g->region = ARENA_TAKE(arena, uint32_t, mesh->cap_nt);
 	g->taken = ARENA_TAKE(arena, uint32_t, mesh->nt);
+	g->entry = ARENA_TAKE(arena, uint8_t, mesh->nt);
 	g->vertex = ARENA_TAKE(arena, uint32_t, mesh->nv);
 	g->seen = ARENA_NEW(arena, uint32_t, mesh->nv);
 	g->projected = arena_take(arena, mesh->nv, sizeof *g->projected);
 	g->settled = ARENA_NEW(arena, bool, 3 * (size_t)mesh->nt);
 	g->point = ARENA_TAKE(arena, struct vec3, mesh->nv);
 	s->region = ARENA_TAKE(arena, struct region_plane, BINS);
-	if (!g->place || !g->turn || !g->region || !g->taken || !g->vertex || !g->seen || !g->projected ||
+	if (!g->place || !g->turn || !g->region || !g->taken || !g->entry || !g->vertex || !g->seen || !g->projected ||
 	    !g->settled || !g->point || !s->region)
 		return -ENOMEM;
 	memset(g->region, 0xff, mesh->cap_nt * sizeof *g->region);

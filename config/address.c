@@ -74,9 +74,38 @@ static int parse_host(const char *text, int port, struct address *ret, char erro
 
 static const char *expected(unsigned kinds)
 {
+	if (kinds & ADDRESS_WS)
+		return "unix:PATH, tcp:HOST:PORT or ws://HOST:PORT/";
 	if (kinds == (ADDRESS_UNIX | ADDRESS_UDP))
 		return "unix:PATH or udp:HOST:PORT";
 	return "unix:PATH or tcp:HOST:PORT";
+}
+
+/* What a request's first line can hold: a blank or a line's end in it would make it another request. */
+static int parse_target(const char *text, const char *target, struct address *ret, char error[ADDRESS_ERROR_MAX])
+{
+	const bool no_path = *target != '/';
+	if (strlen(target) + no_path >= ADDRESS_TARGET_MAX)
+		return refuse(error, "'%.60s...': path and query have less than %d bytes", text, ADDRESS_TARGET_MAX);
+	for (const char *c = target; *c; c++)
+		if (*c <= ' ' || *c > '~' || *c == '#')
+			return refuse(error, "'%.60s': a path has neither blanks nor # in it", text);
+	ret->target[0] = '/';
+	strcpy(ret->target + no_path, target);
+	return 0;
+}
+
+/* What stands behind ws:// */
+static int parse_web(const char *text, struct address *ret, char error[ADDRESS_ERROR_MAX])
+{
+	char authority[ADDRESS_HOST_MAX + 8];
+	const size_t len = strcspn(text, "/?#");
+	if (len >= sizeof(authority))
+		return refuse(error, "'%.60s...': no host has so long a name", text);
+	memcpy(authority, text, len);
+	authority[len] = '\0';
+	const int status = parse_host(authority, ADDRESS_PORT_HTTP, ret, error);
+	return status ? status : parse_target(text, text + len, ret, error);
 }
 
 int address_parse(const char *text, unsigned kinds, struct address *ret, char error[ADDRESS_ERROR_MAX])
@@ -92,8 +121,14 @@ int address_parse(const char *text, unsigned kinds, struct address *ret, char er
 	} else if (strncmp(text, "udp:", 4) == 0 && (kinds & ADDRESS_UDP)) {
 		address.kind = ADDRESS_UDP;
 		status = parse_host(text + 4, -1, &address, error);
-	} else if (strncmp(text, "ws:", 3) == 0 || strncmp(text, "wss:", 4) == 0) {
-		return refuse(error, "'%.60s': WebSockets will come later; use %s", text, expected(kinds));
+	} else if (strncmp(text, "ws://", 5) == 0 && (kinds & ADDRESS_WS)) {
+		address.kind = ADDRESS_WS;
+		status = parse_web(text + 5, &address, error);
+	} else if (strncmp(text, "wss://", 6) == 0 && (kinds & ADDRESS_WS)) {
+		return refuse(error,
+		              "'%.40s': TLS is for browsers; use ssh -L %d:127.0.0.1:%d HOST and ws://127.0.0.1:%d/, "
+		              "or unix:PATH on the robot",
+		              text, ADDRESS_PORT_HTTP, ADDRESS_PORT_HTTP, ADDRESS_PORT_HTTP);
 	} else {
 		return refuse(error, "'%.60s' is not an address; write %s", text, expected(kinds));
 	}
@@ -174,13 +209,14 @@ int address_sockaddr(const struct address *address, struct sockaddr_storage *ret
 
 void address_print(const struct address *address, char ret[ADDRESS_TEXT_MAX])
 {
-	const char *word = address->kind == ADDRESS_UDP ? "udp" : "tcp";
+	const char *word = address->kind == ADDRESS_UDP ? "udp:" : address->kind == ADDRESS_WS ? "ws://" : "tcp:";
+	const int path = address->kind == ADDRESS_WS ? (int)strcspn(address->target, "?") : 0;
 	const bool v6 = strchr(address->host, ':') != NULL;
 	if (address->kind == ADDRESS_UNIX)
 		snprintf(ret, ADDRESS_TEXT_MAX, "unix:%s", address->path);
 	else
-		snprintf(ret, ADDRESS_TEXT_MAX, "%s:%s%s%s:%u", word, v6 ? "[" : "", address->host, v6 ? "]" : "",
-		         address->port);
+		snprintf(ret, ADDRESS_TEXT_MAX, "%s%s%s%s:%u%.*s", word, v6 ? "[" : "", address->host, v6 ? "]" : "",
+		         address->port, path, address->target);
 }
 
 const char *address_default(char ret[ADDRESS_TEXT_MAX])

@@ -99,7 +99,7 @@ while [ ! -e "$1/stop" ]; do
 done
 S
 address=unix:$scratch/run/facetd.sock
-"$facet" simulate hall --endless --dir "$scratch/run" -- sh "$scratch/daemons" "$scratch" "$build/facetd" >"$scratch/simulator.log" 2>&1 &
+"$facet" simulate hall --endless --dir "$scratch/run" --http 127.0.0.1:0 -- sh "$scratch/daemons" "$scratch" "$build/facetd" >"$scratch/simulator.log" 2>&1 &
 simulator=$!
 until_true 30 "$facet" save "$address" --wait-steps 200 -o "$scratch/early.ply" || { cat "$scratch/daemon.log"; fail "no map"; exit 1; }
 
@@ -127,7 +127,18 @@ same() { # WHERE
     python3 tools/facet.py "$address" --commits 1 --hash -o "$scratch/python.ply" >"$scratch/python" || fail "$1: facet.py"
     python3 tools/facet.py "$address" --commits 1 --hash --coded | grep '^hash' >"$scratch/python_coded"
     grep '^hash' "$scratch/python" >"$scratch/python_plain"
-    for other in coded cxx python_plain python_coded; do
+    others="coded cxx python_plain python_coded"
+    # The same through a WebSocket, where the build has any.
+    web=$(sed -n 's|.*listens on http://|ws://|p' "$scratch/daemon.log" | tail -n 1)
+    if [ -n "$web" ]; then
+        "$scratch/hash" "${web}native" plain >"$scratch/web"
+        "$scratch/hash" "$web" coded >"$scratch/web_coded"
+        python3 tools/facet.py "${web}?x=y" --commits 1 --hash | grep '^hash' >"$scratch/python_web"
+        "$facet" watch --once --json "$web" | grep -q '"class":"STATUS"' || fail "$1: facet watch $web"
+        others="$others web web_coded python_web"
+        echo "note: and through a WebSocket at ${web%%[0-9]*}..."
+    fi
+    for other in $others; do
         cmp -s "$scratch/plain" "$scratch/$other" || fail "$1: $other holds $(cat "$scratch/$other"), not $(cat "$scratch/plain")"
     done
     "$facet" save "$address" -o "$scratch/save.ply" >"$scratch/save" || fail "$1: facet save"

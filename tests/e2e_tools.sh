@@ -50,7 +50,7 @@ refused 1 "no daemon answers at $address" "$facet" watch --once "$address"
 refused 1 "make its folder first" "$facet" save "$address" -o "$scratch/missing/none.ply"
 refused 2 "names no format" "$facet" save "$address" -o "$scratch/none.xyz"
 refused 2 "is not an address" "$facet" watch --once somewhere
-refused 2 "will come later" "$facet" save ws://127.0.0.1:7880/ -o "$scratch/none.ply"
+refused 2 "ssh -L" "$facet" save wss://127.0.0.1:7880/ -o "$scratch/none.ply"
 refused 1 "cannot be read" "$facet" picture "$scratch/none.ply" -o "$scratch/none.png"
 for command in save watch picture; do
     "$facet" $command --help | grep -q '^Usage: facet' || fail "facet $command --help says nothing"

@@ -32,6 +32,44 @@ static void good_addresses_are_read_and_written_alike(void **state)
 	}
 }
 
+static void a_websocket_is_a_host_a_port_and_what_may_be_asked(void **state)
+{
+	(void)state;
+	static const struct {
+		const char *text, *host, *target, *printed;
+		uint16_t port;
+	} good[] = {{"ws://127.0.0.1", "127.0.0.1", "/", "ws://127.0.0.1:7880/", 7880},
+	            {"ws://robot:80/native", "robot", "/native", "ws://robot:80/native", 80},
+	            {"ws://[::1]:9/?token=ab", "::1", "/?token=ab", "ws://[::1]:9/", 9},
+	            {"ws://robot?token=ab", "robot", "/?token=ab", "ws://robot:7880/", 7880}};
+	static const char *const bad[] = {"ws://",
+	                                  "ws:///native",
+	                                  "ws://robot:x/",
+	                                  "ws://robot/a b",
+	                                  "ws://robot/a\r\nHost: b",
+	                                  "ws://robot/#token=ab",
+	                                  "ws:127.0.0.1",
+	                                  "wss://robot/"};
+	struct address address;
+	char text[ADDRESS_TEXT_MAX], error[ADDRESS_ERROR_MAX];
+	for (size_t i = 0; i < sizeof(good) / sizeof(good[0]); i++) {
+		assert_int_equal(address_parse(good[i].text, ADDRESS_UNIX | ADDRESS_WS, &address, error), 0);
+		assert_int_equal(address.kind, ADDRESS_WS);
+		assert_string_equal(address.host, good[i].host);
+		assert_string_equal(address.target, good[i].target);
+		assert_int_equal(address.port, good[i].port);
+		address_print(&address, text);
+		assert_string_equal(text, good[i].printed); /* without what is secret */
+	}
+	for (size_t i = 0; i < sizeof(bad) / sizeof(bad[0]); i++)
+		assert_int_equal(address_parse(bad[i], ADDRESS_UNIX | ADDRESS_WS, &address, error), -EINVAL);
+	assert_non_null(strstr(error, "ssh -L"));
+	snprintf(text, sizeof(text), "ws://robot/%0310d", 0);
+	assert_int_equal(address_parse(text, ADDRESS_WS, &address, error), 0);
+	snprintf(text, sizeof(text), "ws://robot/%0320d", 0);
+	assert_int_equal(address_parse(text, ADDRESS_WS, &address, error), -EINVAL);
+}
+
 static void a_missing_tcp_port_is_7878(void **state)
 {
 	(void)state;
@@ -61,8 +99,8 @@ static void bad_addresses_are_refused_with_what_to_write(void **state)
 	    {"tcp:[::1", "closing ]"},
 	    {"tcp:[::1]7878", "a colon"},
 	    {"udp:127.0.0.1:1", "is not an address"},
-	    {"ws://127.0.0.1:7880/", "will come later"},
-	    {"wss://robot/", "will come later"},
+	    {"ws://127.0.0.1:7880/", "is not an address"},
+	    {"wss://robot/", "is not an address"},
 	    {"tcp:a\nb:1:2", "is not a port"},
 	};
 	for (size_t i = 0; i < sizeof(bad) / sizeof(bad[0]); i++) {
@@ -158,6 +196,7 @@ int main(void)
 {
 	const struct CMUnitTest tests[] = {
 	    cmocka_unit_test(good_addresses_are_read_and_written_alike),
+	    cmocka_unit_test(a_websocket_is_a_host_a_port_and_what_may_be_asked),
 	    cmocka_unit_test(a_missing_tcp_port_is_7878),
 	    cmocka_unit_test(bad_addresses_are_refused_with_what_to_write),
 	    cmocka_unit_test(a_unix_path_of_108_bytes_is_refused_one_of_107_fits),

@@ -239,8 +239,11 @@ static void where_no_daemon_is_the_sentence_names_the_address(void **state)
 	assert_non_null(strstr(error, "start facetd"));
 	assert_null(client_open("tcp:127.0.0.1:1", 1000, error));
 	assert_non_null(strstr(error, "tcp:127.0.0.1:1"));
-	assert_null(client_open("ws://127.0.0.1:7880/", 100, error));
-	assert_non_null(strstr(error, "will come later"));
+	assert_null(client_open("ws://127.0.0.1:1/?token=secret", 1000, error));
+	assert_non_null(strstr(error, "ws://127.0.0.1:1/"));
+	assert_null(strstr(error, "secret"));
+	assert_null(client_open("wss://127.0.0.1:7880/", 100, error));
+	assert_non_null(strstr(error, "ssh -L"));
 }
 
 int main(void)

@@ -50,7 +50,7 @@ struct facet_patch;
 
 /* Connections --------------------------------------------------------------------------------------------------------- */
 
-/* `address`: unix:PATH or tcp:HOST:PORT; NULL or empty: the default one. Waits at most `timeout_ms`. NULL with one sentence
+/* `address`: unix:PATH, tcp:HOST:PORT or ws://HOST:PORT/ (with ?token=TOKEN where one is needed); NULL or empty: the default one. Waits at most `timeout_ms`. NULL with one sentence
  * in `error` (may be NULL). */
 FACET_API struct facet *facet_open(const char *address, int timeout_ms, char error[FACET_ERROR_MAX]);
 FACET_API void facet_close(struct facet *); /* NULL is fine */

@@ -25,6 +25,7 @@ import socket
 import struct
 import sys
 import time
+import urllib.parse
 
 PORT = 7878
 LATTICE = 256
@@ -375,8 +376,98 @@ def default_address():
     return "unix:" + (own if os.environ.get("XDG_RUNTIME_DIR") and os.path.exists(own) else "/run/facetd/facetd.sock")
 
 
+class _WebSocket:
+    """The bytes within a WebSocket (RFC 6455), with what Client asks of a socket."""
+
+    def __init__(self, address, timeout_s):
+        url = urllib.parse.urlsplit(address)
+        target = (url.path or "/") + ("?" + url.query if url.query else "")
+        key = base64.b64encode(os.urandom(16)).decode()
+        self._in, self._reason = bytearray(), None
+        self._sock = socket.create_connection((url.hostname or "", url.port or 7880), timeout_s)
+        try:
+            self._sock.sendall(f"GET {target} HTTP/1.1\r\nHost: {url.netloc}\r\nUpgrade: websocket\r\nConnection: Upgrade\r\n"
+                               f"Sec-WebSocket-Key: {key}\r\nSec-WebSocket-Version: 13\r\n"
+                               "Sec-WebSocket-Protocol: facetd.v1\r\n\r\n".encode())
+            while b"\r\n\r\n" not in self._in:
+                more = self._sock.recv(4096)
+                if not more or len(self._in) > 8192:
+                    raise Error(f"{url.netloc} does not answer as facetd's listen.http does")
+                self._in += more
+            self._judge(url.netloc, key)
+        except BaseException:
+            self._sock.close()
+            raise
+
+    def _judge(self, where, key):
+        head, _, rest = bytes(self._in).partition(b"\r\n\r\n")
+        status, *lines = head.decode("latin-1").split("\r\n")
+        fields = {name.strip().lower(): value.strip() for name, _, value in (line.partition(":") for line in lines)}
+        if status.split(" ")[1:2] in (["401"], ["403"]):
+            raise Error(f"{where} wants another token; write ws://HOST:PORT/?token=TOKEN")
+        accept = base64.b64encode(hashlib.sha1((key + "258EAFA5-E914-47DA-95CA-C5AB0DC85B11").encode()).digest()).decode()
+        if status.split(" ")[1:2] != ["101"] or fields.get("sec-websocket-accept") != accept \
+                or fields.get("sec-websocket-protocol") != "facetd.v1":
+            raise Error(f"{where} opens no WebSocket for facetd.v1 ({status}); is listen.http of facetd there?")
+        self._in = bytearray(rest)
+
+    def fileno(self):
+        return self._sock.fileno()
+
+    def settimeout(self, seconds):
+        self._sock.settimeout(seconds)
+
+    def close(self):
+        self._sock.close()
+
+    def sendall(self, data, opcode=2):
+        mask = os.urandom(4)
+        n = len(data)
+        size = struct.pack(">B", 0x80 | n) if n < 126 else struct.pack(">BH", 0xFE, n) if n < 65536 else struct.pack(">BQ", 0xFF, n)
+        self._sock.sendall(bytes([0x80 | opcode]) + size + mask + bytes(b ^ mask[i & 3] for i, b in enumerate(data)))
+
+    def _take(self):
+        """(opcode, payload) of the first frame, or None while it is not whole."""
+        data = self._in
+        if len(data) < 2:
+            return None
+        n, at = data[1], 2
+        if n >= 126:
+            wide = 2 if n == 126 else 8
+            if len(data) < 2 + wide:
+                return None
+            n, at = int.from_bytes(data[2:2 + wide], "big"), 2 + wide
+        if data[0] & 0x70 or data[1] & 0x80 or n > FRAME_MAX:
+            raise OSError("a WebSocket frame that no server sends")
+        if len(data) < at + n:
+            return None
+        frame = data[0] & 15, bytes(data[at:at + n])
+        del data[:at + n]
+        return frame
+
+    def recv(self, n):
+        while True:
+            frame = self._take()
+            if frame is None:
+                more = self._sock.recv(n)
+                if not more:
+                    return more
+                self._in += more
+            elif frame[0] == 8:
+                self.sendall(frame[1][:2], 8)
+                raise OSError(frame[1][2:].decode(errors="replace") or "the daemon closed it")
+            elif frame[0] == 9:
+                self.sendall(frame[1], 10)
+            elif frame[0] in (0, 2) and frame[1]:
+                return frame[1]
+
+
 def _connect(address, timeout_s):
     kind, _, rest = address.partition(":")
+    if kind == "ws":
+        return _WebSocket(address, timeout_s)
+    if kind == "wss":
+        raise Error(f"{address}: TLS is for browsers; use ssh -L 7880:127.0.0.1:7880 HOST and ws://127.0.0.1:7880/")
     if kind == "unix":
         sock = socket.socket(socket.AF_UNIX, socket.SOCK_STREAM)
         sock.settimeout(timeout_s)
@@ -393,7 +484,7 @@ def _connect(address, timeout_s):
         if not port.isdigit():
             raise Error(f"{address} is not an address: the port is no number")
         return socket.create_connection((host.strip("[]"), int(port)), timeout_s)
-    raise Error(f"{address} is not an address: write unix:PATH or tcp:HOST:PORT")
+    raise Error(f"{address} is not an address: write unix:PATH, tcp:HOST:PORT or ws://HOST:PORT/")
 
 
 class Client:
@@ -626,7 +717,7 @@ def _numbers(n):
 
 def main():
     parser = argparse.ArgumentParser(description="Follows the map of a running facetd; with -o, saves it and ends.")
-    parser.add_argument("address", nargs="?", help="unix:PATH or tcp:HOST:PORT; default: $FACETD, the user's socket, the system's")
+    parser.add_argument("address", nargs="?", help="unix:PATH, tcp:HOST:PORT or ws://HOST:PORT/; default: $FACETD, the user's socket, the system's")
     parser.add_argument("-o", metavar="OUT.ply", help="write the first whole map (see --commits) to this file")
     parser.add_argument("--box", type=_numbers(6), metavar="X0,Y0,Z0,X1,Y1,Z1", help="only patches that reach into it (m)")
     parser.add_argument("--radius", type=float, metavar="M", help="only patches about the robot")

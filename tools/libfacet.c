@@ -2,7 +2,8 @@
  * whole; what a client may want to know of them becomes an event. Nothing here waits but facet_wait, which polls around
  * facet_next, and facet_follow, which connects again around facet_wait.
  *
- * A connection speaks frames once it has wanted a map, lines if it has said something before. It is `broken` after an
+ * A connection speaks frames once it has wanted a map, lines if it has said something before. Over a WebSocket it is the same:
+ * binary messages are the stream of frames, texts are lines (libfacet_websocket.h). It is `broken` after an
  * error: its bytes can no longer be told apart, so nothing more is read, and the first sentence stays. */
 #include "tools/facet.h"
 
@@ -12,12 +13,14 @@
 #include <stdio.h>
 #include <stdlib.h>
 #include <string.h>
+#include <sys/random.h>
 #include <sys/socket.h>
 #include <time.h>
 #include <unistd.h>
 
 #include "config/address.h"
 #include "tools/libfacet.h"
+#include "tools/libfacet_websocket.h"
 
 enum { READ_CHUNK = 256 << 10, READS_MAX = 64, RETRY_MS = 1000, ANSWER_MS = 5000 };
 
@@ -40,6 +43,8 @@ struct facet {
 	struct buffer text;     /* of the last event */
 	struct patch **list;    /* of facet_patches */
 	size_t out_at;
+	struct websocket ws; /* of ws: addresses */
+	struct buffer plain; /* a message before it becomes a frame of it */
 	uint8_t *data;
 	size_t begin, end, cap; /* data[begin..end) is read, not yet handled */
 };
@@ -64,6 +69,33 @@ static int fail(struct facet *facet, int code, const char *format, ...)
 
 /* Connections --------------------------------------------------------------------------------------------------------- */
 
+static bool is_web(const struct facet *facet)
+{
+	return facet->address.kind == ADDRESS_WS;
+}
+
+static int make_room(struct facet *facet);
+static int hear_web(struct facet *facet, size_t n);
+
+/* What came right behind the server's answer is heard as what is read later. */
+static int open_websocket(struct facet *facet, int timeout_ms)
+{
+	struct buffer rest = {0};
+	int r = make_room(facet);
+	memset(&facet->ws, 0, sizeof(facet->ws));
+	r = r ? r : libfacet_upgrade(facet->fd, &facet->address, timeout_ms, &rest, facet->error);
+	if (r == 0 && rest.len > 0) {
+		memcpy(facet->data + 1, rest.data, rest.len);
+		r = hear_web(facet, rest.len);
+	}
+	buffer_finish(&rest);
+	if (r >= 0)
+		return 0;
+	close(facet->fd);
+	facet->fd = -1;
+	return r;
+}
+
 static int connect_now(struct facet *facet, int timeout_ms)
 {
 	const int fd = libfacet_connect(&facet->address, timeout_ms);
@@ -72,7 +104,7 @@ static int connect_now(struct facet *facet, int timeout_ms)
 		            fd == -EACCES ? "join the group facetd, or ask its owner"
 		                          : "start facetd, or say where it is (ADDRESS or $FACETD)");
 	facet->fd = fd;
-	return 0;
+	return is_web(facet) ? open_websocket(facet, timeout_ms) : 0;
 }
 
 static int parse_address(const char *text, struct address *ret, char *error)
@@ -80,7 +112,7 @@ static int parse_address(const char *text, struct address *ret, char *error)
 	char where[ADDRESS_TEXT_MAX], sentence[ADDRESS_ERROR_MAX];
 	if (!text || !text[0])
 		text = address_default(where);
-	const int r = address_parse(text, ADDRESS_UNIX | ADDRESS_TCP, ret, sentence);
+	const int r = address_parse(text, ADDRESS_UNIX | ADDRESS_TCP | ADDRESS_WS, ret, sentence);
 	if (r && error)
 		snprintf(error, FACET_ERROR_MAX, "%s", sentence);
 	return r;
@@ -106,8 +138,20 @@ struct facet *facet_open(const char *address, int timeout_ms, char error[FACET_E
 	return NULL;
 }
 
+/* Best effort: who goes says so, if nothing of his is half said. */
+static void say_goodbye(struct facet *facet)
+{
+	struct buffer frame = {0};
+	websocket_put(&frame, WEBSOCKET_CLOSE, (const uint8_t[4]){0}, "\x03\xe8", 2); /* 1000 */
+	if (!frame.error && facet->out.len == facet->out_at && !facet->ws.closed)
+		send(facet->fd, frame.data, frame.len, MSG_NOSIGNAL);
+	buffer_finish(&frame);
+}
+
 static void hang_up(struct facet *facet)
 {
+	if (is_web(facet) && facet->fd >= 0)
+		say_goodbye(facet);
 	if (facet->fd >= 0)
 		close(facet->fd);
 	facet->fd = -1;
@@ -126,6 +170,7 @@ void facet_close(struct facet *facet)
 	hang_up(facet);
 	native_mirror_destroy(facet->mirror);
 	buffer_finish(&facet->out);
+	buffer_finish(&facet->plain);
 	buffer_finish(&facet->unpacked);
 	buffer_finish(&facet->text);
 	free(facet->list);
@@ -202,6 +247,30 @@ static int send_out(struct facet *facet)
 	return 0;
 }
 
+static void draw_mask(uint8_t mask[4])
+{
+	if (getrandom(mask, 4, GRND_NONBLOCK) != 4)
+		memset(mask, 0x5a, 4); /* early at boot; it hides nothing, it keeps proxies from being confused */
+}
+
+/* Where a message is put together; end_message sends it. */
+static struct buffer *begin_message(struct facet *facet)
+{
+	facet->plain.len = 0;
+	return is_web(facet) ? &facet->plain : &facet->out;
+}
+
+static int end_message(struct facet *facet, enum websocket_opcode kind)
+{
+	uint8_t mask[4];
+	draw_mask(mask);
+	if (is_web(facet) && facet->plain.error)
+		return fail(facet, -ENOMEM, "memory is out");
+	if (is_web(facet))
+		websocket_put(&facet->out, kind, mask, facet->plain.data, facet->plain.len);
+	return send_out(facet);
+}
+
 int libfacet_want(struct facet *facet, const struct native_want *want)
 {
 	facet->wants = true;
@@ -212,8 +281,8 @@ int libfacet_want(struct facet *facet, const struct native_want *want)
 		return fail(facet, -EINVAL, "%s: this connection speaks lines; open another one for the map",
 		            facet->where);
 	facet->language = FRAMES;
-	native_put_want(&facet->out, want);
-	return send_out(facet);
+	native_put_want(begin_message(facet), want);
+	return end_message(facet, WEBSOCKET_BINARY);
 }
 
 static int wish(struct facet *facet, const struct facet_want *want, struct native_want *ret)
@@ -251,14 +320,16 @@ int facet_say(struct facet *facet, const char *line)
 		return fail(facet, -EINVAL, "a command is one line of at most %u bytes", NATIVE_FROM_CLIENT_MAX / 2);
 	if (facet->language == SILENT)
 		facet->language = LINES;
+	struct buffer *message = begin_message(facet);
 	if (facet->language == FRAMES) {
-		native_put_json(&facet->out, line, strlen(line));
-	} else {
-		/* In one piece: who answers the line may close before a second one arrives. */
-		buffer_append(&facet->out, line, strlen(line));
-		buffer_append(&facet->out, "\n", 1);
+		native_put_json(message, line, strlen(line));
+		return end_message(facet, WEBSOCKET_BINARY);
 	}
-	return send_out(facet);
+	/* In one piece: who answers the line may close before a second one arrives. */
+	buffer_append(message, line, strlen(line));
+	if (!is_web(facet))
+		buffer_append(message, "\n", 1);
+	return end_message(facet, WEBSOCKET_TEXT);
 }
 
 /* Reading ------------------------------------------------------------------------------------------------------------- */
@@ -282,6 +353,24 @@ static int make_room(struct facet *facet)
 	return 0;
 }
 
+/* `n` bytes of a WebSocket stand one byte behind the end of what is read. 1: they are heard, -errno. */
+static int hear_web(struct facet *facet, size_t n)
+{
+	char sentence[WEBSOCKET_ERROR_MAX];
+	uint8_t mask[4];
+	draw_mask(mask);
+	const ssize_t kept = websocket_hear(&facet->ws, facet->data + facet->end, n, mask, &facet->out, sentence);
+	flush(facet);
+	if (facet->ws.closed && facet->ws.reason[0])
+		snprintf(facet->reason, sizeof(facet->reason), "%s", facet->ws.reason);
+	if (kept == -ECONNRESET)
+		return lose(facet, -ECONNRESET);
+	if (kept < 0)
+		return fail(facet, (int)kept, "%s: %s", facet->where, sentence);
+	facet->end += (size_t)kept;
+	return 1;
+}
+
 /* 1: something was read, 0: there is nothing, -errno. */
 static int read_more(struct facet *facet)
 {
@@ -289,7 +378,10 @@ static int read_more(struct facet *facet)
 	if (room)
 		return room;
 	for (;;) {
-		const ssize_t n = recv(facet->fd, facet->data + facet->end, facet->cap - facet->end, 0);
+		const size_t spare = is_web(facet); /* websocket_hear wants a byte before them */
+		const ssize_t n = recv(facet->fd, facet->data + facet->end + spare, facet->cap - facet->end - spare, 0);
+		if (n > 0 && is_web(facet))
+			return hear_web(facet, (size_t)n);
 		if (n > 0) {
 			facet->end += (size_t)n;
 			return 1;

@@ -14,4 +14,9 @@ const struct native_mirror *libfacet_mirror(const struct facet *);
 struct address;
 int libfacet_connect(const struct address *, int timeout_ms);
 
+/* Opens a WebSocket on it. Bytes that came behind the answer are appended to `ret_rest`. 0, or -errno with a sentence. */
+struct buffer;
+int libfacet_upgrade(int fd, const struct address *, int timeout_ms, struct buffer *ret_rest,
+                     char error[FACET_ERROR_MAX]);
+
 #endif

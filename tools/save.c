@@ -135,7 +135,7 @@ static int judge_job(const struct job *job)
 	struct output_error error;
 	struct address address;
 	char sentence[ADDRESS_ERROR_MAX];
-	if (job->address && address_parse(job->address, ADDRESS_UNIX | ADDRESS_TCP, &address, sentence)) {
+	if (job->address && address_parse(job->address, ADDRESS_UNIX | ADDRESS_TCP | ADDRESS_WS, &address, sentence)) {
 		fprintf(stderr, "facet: %s\n", sentence);
 		return 2;
 	}
@@ -157,7 +157,7 @@ int save_main(int argc, char **argv)
 	    parse_option,
 	    "[ADDRESS] -o OUT",
 	    "A consistent snapshot of a running daemon's map.\v"
-	    "ADDRESS is unix:PATH or tcp:HOST:PORT; default: $FACETD, the user's own socket, the "
+	    "ADDRESS is unix:PATH, tcp:HOST:PORT or ws://HOST:PORT/; default: $FACETD, the user's own socket, the "
 	    "system's.",
 	    NULL,
 	    NULL,

@@ -510,7 +510,7 @@ int watch_main(int argc, char **argv)
 	    parse_option,
 	    "[ADDRESS]",
 	    "What a running daemon does, live.\v"
-	    "ADDRESS is unix:PATH or tcp:HOST:PORT; default: $FACETD, the user's own socket, "
+	    "ADDRESS is unix:PATH, tcp:HOST:PORT or ws://HOST:PORT/; default: $FACETD, the user's own socket, "
 	    "the system's.\n\n"
 	    "RATE is what came a second, of what the device says it measures; JITTER how far arrivals are behind the "
 	    "least "
@@ -526,7 +526,8 @@ int watch_main(int argc, char **argv)
 	struct address address;
 	char sentence[ADDRESS_ERROR_MAX];
 	argp_parse(&argp, argc, argv, 0, NULL, &watch);
-	if (watch.address && address_parse(watch.address, ADDRESS_UNIX | ADDRESS_TCP, &address, sentence)) {
+	if (watch.address &&
+	    address_parse(watch.address, ADDRESS_UNIX | ADDRESS_TCP | ADDRESS_WS, &address, sentence)) {
 		fprintf(stderr, "facet: %s\n", sentence);
 		return 2;
 	}

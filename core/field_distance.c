@@ -20,7 +20,6 @@
 
 #define RASTERS_MAX     8         /* scanners at once; another one takes the place of the raster in its slot */
 #define SAMPLE_STEP     0.7       /* cells */
-#define SAMPLES_MAX     32        /* along one side of a quad: bounds the cost of tiny cells */
 #define WEIGHT_BEAM     32.0      /* of a beam straight on */
 #define WEIGHT_SINGLE   1.0       /* of one that belongs to no surface */
 #define FLAT_SINE       0.0697565 /* sin(4 degrees) */
@@ -132,7 +131,7 @@ static int samples_along(double a2, double b2)
 	if (m2 <= SAMPLE_STEP * SAMPLE_STEP)
 		return 1;
 	n = sqrt(m2) / SAMPLE_STEP;
-	return n > SAMPLES_MAX - 1 ? SAMPLES_MAX : (int)n + 1;
+	return n > FOLD_PATCH_SIDE - 1 ? FOLD_PATCH_SIDE : (int)n + 1;
 }
 
 static void quad_add(struct field *field, const struct raster_line *above, const struct raster_line *line, int32_t c)
@@ -152,17 +151,10 @@ static void quad_add(struct field *field, const struct raster_line *above, const
 		return;
 	struct fold_plane plane = fold_plane(n, WEIGHT_BEAM * sine / sqrt(across * along));
 
-	if (across * along == 1) {
+	if (across * along == 1)
 		fold_sample(field->fold, &plane, middle);
-		return;
-	}
-	for (int j = 0; j < along; j++) {
-		double v = (j + 0.5) / along;
-		struct vec3 left = vec3_lerp(p[0], p[2], v), right = vec3_lerp(p[1], p[3], v);
-
-		for (int i = 0; i < across; i++)
-			fold_sample(field->fold, &plane, vec3_lerp(left, right, (i + 0.5) / across));
-	}
+	else
+		fold_patch(field->fold, &plane, p, across, along);
 }
 
 /* The unit axis along which the view is longest, towards the scanner. */

@@ -12,14 +12,22 @@
  * same ones are refused whatever the order of the contributions. */
 #include "core/scratch.h"
 
+#include <assert.h>
+#include <stddef.h>
 #include <stdlib.h>
 #include <string.h>
 
 #define SLOTS        (4 * FOLD_BLOCKS_MAX)
-#define BAND_UNITS   ((int32_t)(BAND_CELLS * LATTICE))
 #define WEIGHT_SCALE 4
 
 _Static_assert((SLOTS & (SLOTS - 1)) == 0, "slots are a power of two");
+
+/* Rays look into blocks that have negative voxels. */
+static void hollow_mark(void *ctx, struct block *block)
+{
+	if (block->layers[0])
+		*hollow_word(ctx, block->key.y, block->key.z) |= UINT64_C(1) << (block->key.x & (HOLLOW_SIDE - 1));
+}
 
 struct fold *fold_create(struct grid *grid)
 {
@@ -31,12 +39,14 @@ struct fold *fold_create(struct grid *grid)
 	fold->rays_cap = 1024;
 	fold->block = calloc(FOLD_BLOCKS_MAX, sizeof(*fold->block));
 	fold->slot = calloc(SLOTS, sizeof(*fold->slot));
+	fold->turn = malloc(2 * FOLD_BLOCKS_MAX * sizeof(*fold->turn));
 	fold->ray = malloc(fold->rays_cap * sizeof(*fold->ray));
 	fold->ray_slot = calloc(2 * (size_t)fold->rays_cap, sizeof(*fold->ray_slot));
-	if (!fold->block || !fold->slot || !fold->ray || !fold->ray_slot) {
+	if (!fold->block || !fold->slot || !fold->turn || !fold->ray || !fold->ray_slot) {
 		fold_destroy(fold);
 		return NULL;
 	}
+	grid_each(grid, hollow_mark, fold);
 	return fold;
 }
 
@@ -46,6 +56,9 @@ void fold_destroy(struct fold *fold)
 		return;
 	for (uint32_t i = 0; i < fold->made; i++)
 		free(fold->block[i]);
+	for (uint32_t i = 0; i < SLABS_MAX; i++)
+		free(fold->slab[i]);
+	free(fold->turn);
 	free(fold->block);
 	free(fold->slot);
 	free(fold->ray);
@@ -78,44 +91,89 @@ struct scratch_block *scratch_seek(struct fold *fold, int32_t x, int32_t y, int3
 	return *recent = b;
 }
 
+/* Sees to it that as many columns are at hand, all zero, as a sample or a block may need. */
+static bool columns_reserve(struct fold *fold)
+{
+	struct column **slab = &fold->slab[fold->slabs];
+
+	if (fold->column_end - fold->column >= COLUMNS_AT_HAND)
+		return true;
+	assert(fold->slabs < SLABS_MAX);
+	if (!*slab) {
+		*slab = aligned_alloc(_Alignof(struct column), SLAB_COLUMNS * sizeof(**slab));
+		if (!*slab)
+			return false;
+		memset(*slab, 0, SLAB_COLUMNS * sizeof(**slab));
+	}
+	fold->slabs++;
+	fold->column = *slab;
+	fold->column_end = *slab + SLAB_COLUMNS;
+	return true;
+}
+
+/* The column with a number along an axis of a block; a new one if there is none, without a branch. */
+static inline struct column *column_of(struct fold *fold, struct scratch_block *block, int axis, int number)
+{
+	const int seen = (int)(block->seen[axis] >> number & 1);
+	struct column *const either[2] = {fold->column, block->column[axis][number]}, *const column = either[seen];
+
+	block->seen[axis] |= UINT64_C(1) << number;
+	block->column[axis][number] = column;
+	fold->column += !seen;
+	return column;
+}
+
+/* The coordinates of a point or a normal in the order of a plane: along its axis, the lesser and the greater other one. */
+static void turn_to(int axis, struct vec3 v, double ret[3])
+{
+	ret[0] = axis == 0 ? v.x : axis == 1 ? v.y : v.z;
+	ret[1] = axis == 0 ? v.y : v.x;
+	ret[2] = axis == 2 ? v.y : v.z;
+}
+
 struct fold_plane fold_plane(struct vec3 normal, double weight)
 {
-	struct fold_plane plane = {.n = {normal.x, normal.y, normal.z}};
+	const double x = fabs(normal.x), y = fabs(normal.y), z = fabs(normal.z);
+	struct fold_plane plane = {.axis = y > x ? 1 : 0};
 
-	if (fabs(plane.n[1]) > fabs(plane.n[plane.axis]))
-		plane.axis = 1;
-	if (fabs(plane.n[2]) > fabs(plane.n[plane.axis]))
+	if (z > (x > y ? x : y))
 		plane.axis = 2;
-	plane.inverse = 1 / plane.n[plane.axis];
+	turn_to(plane.axis, normal, plane.n);
+	plane.inverse = 1 / plane.n[0];
 	plane.half = BAND_CELLS * fabs(plane.inverse);
-	plane.step = floor_int(plane.n[plane.axis] * 65536 + 0.5);
-	plane.weight = (int32_t)(weight * (WEIGHT_SCALE * 65536.0 / BAND_UNITS) + 0.5);
+	plane.step = floor_int(plane.n[0] * 65536 + 0.5);
+	for (int i = 0; i < BLOCK_SIDE; i++) {
+		plane.high[i] = (int16_t)(i * plane.step >> 8);
+		plane.low[i] = (int16_t)(i * plane.step & 255);
+		plane.weight[i] = (int16_t)(weight * (WEIGHT_SCALE * 65536.0 / BAND_UNITS) + 0.5);
+	}
 	return plane;
 }
 
-/* Adds to `n` voxels of a column within one block; `d` is the distance of the first in 1/65536 cell. */
-static void column_add(accumulator *at, int n, int stride, int32_t d, const struct fold_plane *plane)
+/* Adds to the voxels first..last of one column in one block; `d` is the distance of voxel 0 in 1/65536 cell. All eight are
+ * computed, without a branch, in loops that compilers turn into vectors of 16-bit numbers; what is not wanted weighs 0.
+ * Inlined, it would be unrolled into single numbers. */
+static __attribute__((noinline)) void column_add(accumulator *restrict at, const struct fold_plane *restrict plane,
+                                                 int32_t d, int32_t first, int32_t last)
 {
-	for (; n > 0; n--, at += stride, d += plane->step) {
-		int32_t distance = (d + 128) >> 8;
-		int32_t left = BAND_UNITS - (distance < 0 ? -distance : distance);
-		int32_t weight = (left * plane->weight + 32768) >> 16;
+	static const int16_t from[2 * BLOCK_SIDE] = {0, 0, 0, 0, 0, 0, 0, 0, -1, -1, -1, -1, -1, -1, -1, -1};
+	static const int16_t to[2 * BLOCK_SIDE] = {-1, -1, -1, -1, -1, -1, -1, -1, 0, 0, 0, 0, 0, 0, 0, 0};
+	const int16_t *const not_before = from + BLOCK_SIDE - first, *const not_after = to + BLOCK_SIDE - 1 - last;
+	const int16_t high = (int16_t)(((d + 128) >> 8) + BAND_UNITS), low = (int16_t)((d + 128) & 255);
+	int16_t depth[BLOCK_SIDE], weight[BLOCK_SIDE]; /* depth: from the far end of the band */
 
-		weight = weight > 1 ? weight : 1;
-		*at += ((int64_t)(weight * distance) * (1 << WEIGHT_BITS)) + weight;
+	for (int i = 0; i < BLOCK_SIDE; i++) {
+		int16_t carry = (int16_t)((int16_t)(low + plane->low[i]) >> 8);
+		int16_t front = (int16_t)(high + plane->high[i] + carry), back = (int16_t)(2 * BAND_UNITS - front);
+		int16_t left = front < back ? front : back;
+		int16_t w = (int16_t)(left * plane->weight[i] >> 16);
+
+		w = (int16_t)(w + (uint16_t)((uint16_t)(left * plane->weight[i]) >> 15)); /* rounds */
+		weight[i] = (int16_t)((w > 1 ? w : 1) & not_before[i] & not_after[i]);
+		depth[i] = front;
 	}
-}
-
-/* The bits of voxels first, first + stride, ... last in a word of `seen`; strides 1 and 8 only. */
-static void column_mark(struct scratch_block *b, int first, int last, int axis)
-{
-	const uint64_t all = axis == 0 ? ~UINT64_C(0) : UINT64_C(0x0101010101010101) << (first & 7);
-
-	if (axis == 2)
-		b->columns |= UINT64_C(1) << (first & 63);
-	else
-		b->seen[first >> 6] |=
-		    all << (axis == 0 ? first & 63 : 8 * (first >> 3 & 7)) & ~UINT64_C(0) >> (63 - (last & 63));
+	for (int i = 0; i < BLOCK_SIDE; i++)
+		at[i] += (uint64_t)(uint32_t)(weight[i] * depth[i]) * (1 << WEIGHT_BITS) + (uint16_t)weight[i];
 }
 
 /* A full scratch is folded; what follows goes into the empty one. */
@@ -130,47 +188,96 @@ static struct scratch_block *scratch_make_room(struct fold *fold, int32_t x, int
 	return b;
 }
 
+/* Where the band of a sample lies: in the column b, c of the other two axes, voxels first..last along the plane's. */
+struct reach {
+	int32_t b, c, first, last;
+	int32_t d; /* distance of the first in 1/65536 cell */
+};
+
+/* The sample need not lie on a column: what counts is where the plane crosses the nearest one. */
+static struct reach reach_of(const struct fold_plane *plane, const double p[3])
+{
+	const int32_t b = floor_int(p[1] + 0.5), c = floor_int(p[2] + 0.5);
+	const double crossing = p[0] - (plane->n[1] * (b - p[1]) + plane->n[2] * (c - p[2])) * plane->inverse;
+	const int32_t first = -floor_int(plane->half - crossing), last = floor_int(crossing + plane->half);
+
+	return (struct reach){b, c, first, last, floor_int((first - crossing) * plane->n[0] * 65536 + 0.5)};
+}
+
+/* The block where the parts of a reach lie, up to voxel `k` of the column. */
+static struct scratch_block *reach_block(struct fold *fold, int axis, const struct reach *r, int32_t k)
+{
+	const int32_t a = k >> BLOCK_SHIFT, b = r->b >> BLOCK_SHIFT, c = r->c >> BLOCK_SHIFT;
+
+	return scratch_make_room(fold, axis == 0 ? a : b, axis == 0 ? b : axis == 1 ? a : c, axis == 2 ? a : c);
+}
+
+static void reach_add(struct fold *fold, const struct fold_plane *plane, const struct reach *r)
+{
+	const int32_t in = BLOCK_SIDE - 1;
+	const int number = (r->c & in) * BLOCK_SIDE + (r->b & in);
+	int32_t k = r->first & ~in, first = r->first & in, d = r->d - first * plane->step;
+
+	for (; k <= r->last; k += BLOCK_SIDE, first = 0, d += plane->step * BLOCK_SIDE) {
+		struct scratch_block *block = reach_block(fold, plane->axis, r, k);
+
+		if (block && columns_reserve(fold))
+			column_add(column_of(fold, block, plane->axis, number)->at, plane, d, first,
+			           r->last - k < in ? r->last - k : in);
+	}
+}
+
+static void reaches_add(struct fold *fold, const struct fold_plane *plane, const struct reach *reach, int n)
+{
+	for (int i = 0; i < n; i++) {
+		if (fold->samples == FOLD_SAMPLES_MAX)
+			fold_apply(fold);
+		reach_add(fold, plane, &reach[i]);
+		fold->samples++;
+	}
+	fold->stats.samples += (uint64_t)n;
+}
+
 void fold_sample(struct fold *fold, const struct fold_plane *plane, struct vec3 point)
 {
-	static const int next[3] = {1, 2, 0}, after[3] = {2, 0, 1};
-	const double p[3] = {point.x, point.y, point.z};
-	const int a = plane->axis, b = next[a], c = after[a], stride = 1 << BLOCK_SHIFT * a;
-	int32_t at[3], key[3];
+	struct reach reach;
+	double p[3];
 
-	at[b] = floor_int(p[b] + 0.5);
-	at[c] = floor_int(p[c] + 0.5);
-	/* where the plane crosses the column: the sample need not lie on it */
-	double crossing = p[a] - (plane->n[b] * (at[b] - p[b]) + plane->n[c] * (at[c] - p[c])) * plane->inverse;
-	int32_t k = -floor_int(plane->half - crossing), last = floor_int(crossing + plane->half);
-	int32_t d = floor_int((k - crossing) * plane->n[a] * 65536 + 0.5);
+	turn_to(plane->axis, point, p);
+	reach = reach_of(plane, p);
+	reaches_add(fold, plane, &reach, 1);
+}
 
-	if (fold->samples == FOLD_SAMPLES_MAX)
-		fold_apply(fold);
-	fold->samples++;
-	fold->stats.samples++;
-	key[b] = at[b] >> BLOCK_SHIFT;
-	key[c] = at[c] >> BLOCK_SHIFT;
-	at[b] &= BLOCK_SIDE - 1;
-	at[c] &= BLOCK_SIDE - 1;
-	at[a] = 0;
-	const int base = (at[2] * BLOCK_SIDE + at[1]) * BLOCK_SIDE + at[0];
+static double between(double a, double b, double s)
+{
+	return a + (b - a) * s;
+}
 
-	while (k <= last) {
-		int32_t end = k | (BLOCK_SIDE - 1);
-		struct scratch_block *block;
+/* All samples are first calculated and then added: a long chain of arithmetic without branches, then branches that wait
+ * for nothing. */
+void fold_patch(struct fold *fold, const struct fold_plane *plane, const struct vec3 corner[4], int across, int along)
+{
+	struct reach reach[FOLD_PATCH_SIDE * FOLD_PATCH_SIDE], *next = reach;
+	double p[4][3], share[FOLD_PATCH_SIDE];
 
-		end = end < last ? end : last;
-		key[a] = k >> BLOCK_SHIFT;
-		block = scratch_make_room(fold, key[0], key[1], key[2]);
-		if (block) {
-			int first = base + (k & (BLOCK_SIDE - 1)) * stride;
+	for (int i = 0; i < 4; i++)
+		turn_to(plane->axis, corner[i], p[i]);
+	for (int i = 0; i < across; i++)
+		share[i] = (i + 0.5) / across;
+	for (int j = 0; j < along; j++) {
+		double v = (j + 0.5) / along, left[3], right[3], point[3];
 
-			column_add(&block->at[first], end - k + 1, stride, d, plane);
-			column_mark(block, first, base + (end & (BLOCK_SIDE - 1)) * stride, a);
+		for (int a = 0; a < 3; a++) {
+			left[a] = between(p[0][a], p[2][a], v);
+			right[a] = between(p[1][a], p[3][a], v);
 		}
-		d += (end + 1 - k) * plane->step;
-		k = end + 1;
+		for (int i = 0; i < across; i++) {
+			for (int a = 0; a < 3; a++)
+				point[a] = between(left[a], right[a], share[i]);
+			*next++ = reach_of(plane, point);
+		}
 	}
+	reaches_add(fold, plane, reach, across * along);
 }
 
 static int64_t divide_rounded(int64_t a, int64_t b) /* b > 0; halves away from zero */
@@ -178,30 +285,29 @@ static int64_t divide_rounded(int64_t a, int64_t b) /* b > 0; halves away from z
 	return a >= 0 ? (a + b / 2) / b : -((-a + b / 2) / b);
 }
 
-static void voxel_fold(struct voxel *v, accumulator a, uint32_t rays)
+static void voxel_add(struct voxel *v, accumulator a)
 {
-	int64_t sum = v->sum, weight = v->weight;
+	int64_t added = a & ((1 << WEIGHT_BITS) - 1), weight = v->weight + added;
+	int64_t sum = v->sum + (int64_t)(a >> WEIGHT_BITS) - BAND_UNITS * added;
 
-	if (a) {
-		int64_t added = a & ((1 << WEIGHT_BITS) - 1);
-
-		sum += (a - added) / (1 << WEIGHT_BITS); /* exact */
-		weight += added;
-		if (weight > WEIGHT_MAX) {
-			sum = divide_rounded(sum * WEIGHT_MAX, weight);
-			weight = WEIGHT_MAX;
-		}
-	} else if (sum < 0) {
-		int64_t taken = (int64_t)rays * FREE_WEIGHT;
-		int64_t rest = weight > taken ? weight - taken : 0;
-
-		if (rest < WEIGHT_KNOWN)
-			rest = 0;
-		sum = rest ? divide_rounded(sum * rest, weight) : 0;
-		weight = rest;
+	if (weight > WEIGHT_MAX) {
+		sum = divide_rounded(sum * WEIGHT_MAX, weight);
+		weight = WEIGHT_MAX;
 	}
 	v->sum = (int32_t)sum;
 	v->weight = (uint16_t)weight;
+}
+
+static void voxel_clear(struct voxel *v, uint32_t rays)
+{
+	int64_t taken = (int64_t)rays * FREE_WEIGHT, rest = v->weight > taken ? v->weight - taken : 0;
+
+	if (v->sum >= 0)
+		return;
+	if (rest < WEIGHT_KNOWN)
+		rest = 0;
+	v->sum = rest ? (int32_t)divide_rounded(v->sum * rest, v->weight) : 0;
+	v->weight = (uint16_t)rest;
 }
 
 /* A voxel hardly behind a surface is published as lying on it, and once on a side it takes more to change. Walls and floors
@@ -217,43 +323,153 @@ static int published_mean(const struct voxel *v)
 	return mean < 0 && mean >= -touching ? 0 : mean;
 }
 
+/* Is a known voxel's mean, without a division, so near to the published value that it is no news? False: perhaps it is.
+ * VOXEL_UNKNOWN is far from every mean. On the far side a mean that touches would be published as 0. */
+static bool is_no_news(const struct voxel *v)
+{
+	int32_t weight = v->weight, apart = v->sum - v->published * weight;
+	int32_t most = (PUBLISH_STEP - 1) * weight, touching = -(TOUCHING - TOUCHING_STICKS + 1) * weight;
+
+	return (weight >= WEIGHT_KNOWN) & (apart <= most) & (apart >= -most) &
+	       ((v->published >= 0) | (v->sum <= touching));
+}
+
 /* What is to be published of a voxel: the old value where there is no news. */
 static int16_t published_after(const struct voxel *v)
 {
 	int mean;
 
+	if (is_no_news(v))
+		return v->published;
 	if (v->weight < WEIGHT_KNOWN)
 		return VOXEL_UNKNOWN;
 	mean = published_mean(v);
 	return v->published != VOXEL_UNKNOWN && abs(mean - v->published) < PUBLISH_STEP ? v->published : (int16_t)mean;
 }
 
-/* Folds one word (a layer of constant z) and empties its accumulators; the bits that changed. */
-static uint64_t layer_fold(struct fold *fold, struct block *block, struct scratch_block *from, int z)
+/* A column's voxels are first, first + stride, ... */
+static int first_of(int axis, int number)
 {
-	uint64_t bits = from->seen[z] | from->columns | from->passed[z], changed = 0, negative = block->negative[z];
+	const int in = BLOCK_SIDE - 1;
 
-	for (; bits; bits &= bits - 1) {
-		int i = z * 64 + __builtin_ctzll(bits);
-		const uint64_t bit = bits & -bits;
-		struct voxel *v = &block->voxel[i];
+	return axis == 0 ? number * BLOCK_SIDE : axis == 1 ? (number & ~in) * BLOCK_SIDE + (number & in) : number;
+}
 
-		if (!from->at[i] && !(from->passed[z] & bit))
-			continue;
-		voxel_fold(v, from->at[i], from->rays[i]);
-		from->at[i] = 0;
-		from->rays[i] = 0;
-		negative = v->sum < 0 ? negative | bit : negative & ~bit;
-		const int16_t value = published_after(v);
-		if (value != v->published) {
-			block_publish(block, i, value);
-			changed |= bit;
-			fold->stats.cleared += value == VOXEL_UNKNOWN;
+static int stride_of(int axis)
+{
+	return 1 << BLOCK_SHIFT * axis;
+}
+
+/* The column of a voxel and its place there. */
+static int number_of(int axis, int voxel, int *ret_place)
+{
+	const int in = BLOCK_SIDE - 1, x = voxel & in, y = voxel >> BLOCK_SHIFT & in, z = voxel >> 2 * BLOCK_SHIFT;
+
+	*ret_place = axis == 0 ? x : axis == 1 ? y : z;
+	return (axis == 2 ? y : z) * BLOCK_SIDE + (axis == 0 ? y : x);
+}
+
+/* What a voxel is after it got its share. */
+static inline void voxel_settle(struct fold *fold, struct block *block, int i, uint64_t changed[BLOCK_SIDE])
+{
+	const struct voxel *v = &block->voxel[i];
+	const uint64_t bit = UINT64_C(1) << (i & 63), negative = (uint64_t)(v->sum < 0) << (i & 63);
+	const int16_t value = published_after(v);
+
+	block->negative[i >> 6] = (block->negative[i >> 6] & ~bit) | negative;
+	if (value == v->published)
+		return;
+	block_publish(block, i, value);
+	changed[i >> 6] |= bit;
+	fold->stats.cleared += value == VOXEL_UNKNOWN;
+}
+
+/* Adds the columns of one axis to those of another, since a voxel is folded once. */
+static void columns_move(struct fold *fold, struct scratch_block *from, int axis, int to)
+{
+	for (uint64_t bits = from->seen[axis]; bits; bits &= bits - 1) {
+		int number = __builtin_ctzll(bits), voxel = first_of(axis, number), place;
+		accumulator *at = from->column[axis][number]->at;
+
+		for (int i = 0; i < BLOCK_SIDE; i++, voxel += stride_of(axis)) {
+			if (!at[i])
+				continue;
+			number = number_of(to, voxel, &place);
+			column_of(fold, from, to, number)->at[place] += at[i];
+			at[i] = 0;
 		}
 	}
-	from->seen[z] = from->passed[z] = 0;
-	block->negative[z] = negative;
-	return changed;
+	from->seen[axis] = 0;
+}
+
+/* Gathers all columns of a block in one axis, which it says. Few blocks of a row see more than one. */
+static int columns_gather(struct fold *fold, struct scratch_block *from)
+{
+	int to = from->seen[2] ? 2 : from->seen[1] ? 1 : 0;
+
+	for (int axis = 0; axis < to; axis++)
+		if (from->seen[axis] && columns_reserve(fold))
+			columns_move(fold, from, axis, to);
+	return to;
+}
+
+/* Folds the voxels that rays passed and no surface came to. */
+static void passed_fold(struct fold *fold, struct block *block, struct scratch_block *from, int axis,
+                        uint64_t changed[BLOCK_SIDE])
+{
+	for (int z = 0; z < BLOCK_SIDE; z++) {
+		for (uint64_t bits = from->passed[z]; bits; bits &= bits - 1) {
+			int voxel = z * 64 + __builtin_ctzll(bits), place, number = number_of(axis, voxel, &place);
+
+			if (!(from->seen[axis] >> number & 1) || !from->column[axis][number]->at[place]) {
+				voxel_clear(&block->voxel[voxel], from->rays[voxel]);
+				voxel_settle(fold, block, voxel, changed);
+			}
+			from->rays[voxel] = 0;
+		}
+		from->passed[z] = 0;
+	}
+}
+
+struct share {
+	accumulator sum;
+	uint32_t voxel;
+};
+
+/* The voxels that got something, and empties the columns of an axis. */
+static int shares_take(struct scratch_block *from, int axis, struct share ret[BLOCK_VOXELS])
+{
+	const int stride = stride_of(axis);
+	int n = 0;
+
+	for (uint64_t bits = from->seen[axis]; bits; bits &= bits - 1) {
+		int number = __builtin_ctzll(bits), first = first_of(axis, number);
+		struct column *column = from->column[axis][number];
+
+		for (int i = 0; i < BLOCK_SIDE; i++) {
+			ret[n] = (struct share){column->at[i], (uint32_t)(first + i * stride)};
+			n += column->at[i] != 0;
+		}
+		memset(column, 0, sizeof(*column));
+	}
+	from->seen[axis] = 0;
+	return n;
+}
+
+/* Folds the voxels of all columns along an axis. Voxels are far apart: they are asked for some time before. */
+static void columns_fold(struct fold *fold, struct block *block, struct scratch_block *from, int axis,
+                         uint64_t changed[BLOCK_SIDE])
+{
+	struct share share[BLOCK_VOXELS + 1];
+	const int n = shares_take(from, axis, share), ahead = 12;
+
+	for (int i = 0; i < n && i < ahead; i++)
+		__builtin_prefetch(&block->voxel[share[i].voxel], 1);
+	for (int i = 0; i < n; i++) {
+		__builtin_prefetch(&block->voxel[share[i + ahead < n ? i + ahead : i].voxel], 1);
+		voxel_add(&block->voxel[share[i].voxel], share[i].sum);
+		voxel_settle(fold, block, (int)share[i].voxel, changed);
+	}
 }
 
 /* Projects the bits of a block onto its layers along x, y and z. */
@@ -274,15 +490,17 @@ static void layers_of(const uint64_t bits[BLOCK_SIDE], uint8_t ret_layers[3])
 	}
 }
 
+/* Folds a block and empties its accumulators. */
 static void block_fold(struct fold *fold, struct block *block, struct scratch_block *from)
 {
-	uint64_t changed[BLOCK_SIDE];
+	uint64_t changed[BLOCK_SIDE] = {0};
 	uint8_t layers[3];
+	const int axis = columns_gather(fold, from);
 
-	for (int z = 0; z < BLOCK_SIDE; z++)
-		changed[z] = layer_fold(fold, block, from, z);
-	from->columns = 0;
+	passed_fold(fold, block, from, axis, changed);
+	columns_fold(fold, block, from, axis, changed);
 	layers_of(block->negative, block->layers);
+	hollow_mark(fold, block);
 	layers_of(changed, layers);
 	grid_mark_changed(fold->grid, block->key, layers);
 }
@@ -290,36 +508,94 @@ static void block_fold(struct fold *fold, struct block *block, struct scratch_bl
 /* The grid refused the block: what was for it is lost. */
 static void block_drop(struct scratch_block *from)
 {
+	for (int axis = 0; axis < 3; axis++)
+		for (uint64_t bits = from->seen[axis]; bits; bits &= bits - 1)
+			memset(from->column[axis][__builtin_ctzll(bits)], 0, sizeof(struct column));
 	memset(from->seen, 0, sizeof(from->seen));
 	memset(from->passed, 0, sizeof(from->passed));
-	memset(from->at, 0, sizeof(from->at));
 	memset(from->rays, 0, sizeof(from->rays));
-	from->columns = 0;
 }
 
-static int compare_blocks(const void *a, const void *b)
+static struct block **found_at(struct fold *fold, int32_t x, int32_t y, int32_t z)
 {
-	struct block_key p = (*(struct scratch_block *const *)a)->key, q = (*(struct scratch_block *const *)b)->key;
+	return &fold->found[(x & 7) | (y & 7) << 3 | (z & 7) << 6];
+}
 
-	return patch_key_compare((struct patch_key){p.x, p.y, p.z}, (struct patch_key){q.x, q.y, q.z});
+struct block *fold_find(struct fold *fold, int32_t x, int32_t y, int32_t z)
+{
+	struct block **found = found_at(fold, x, y, z), *block = *found;
+
+	if (block && block->key.x == x && block->key.y == y && block->key.z == z)
+		return block;
+	block = grid_find(fold->grid, (struct block_key){x, y, z});
+	if (block)
+		*found = block;
+	return block;
+}
+
+static struct block *block_touch(struct fold *fold, struct block_key key)
+{
+	struct block *block = fold_find(fold, key.x, key.y, key.z);
+
+	return block ? block : grid_touch(fold->grid, key);
+}
+
+/* Orders like patch_key_compare; a block's coordinates fit 21 bits. */
+static uint64_t turn_key(struct block_key key)
+{
+	const int32_t middle = 1 << 20;
+
+	return (uint64_t)(key.z + middle) << 42 | (uint64_t)(key.y + middle) << 21 | (uint64_t)(key.x + middle);
+}
+
+/* Sorts by merging into the second half of fold->turn and back. qsort's calls back took longer than the blocks' folding. */
+static const struct turn *turns_sort(struct fold *fold)
+{
+	const uint32_t n = fold->used;
+	struct turn *from = fold->turn, *to = fold->turn + FOLD_BLOCKS_MAX, *swap;
+
+	for (uint32_t i = 0; i < n; i++)
+		from[i] = (struct turn){turn_key(fold->block[i]->key), fold->block[i]};
+	for (uint32_t width = 1; width < n; width *= 2, swap = from, from = to, to = swap)
+		for (uint32_t begin = 0; begin < n; begin += 2 * width) {
+			uint32_t i = begin, i_end = n - i < width ? n : i + width;
+			uint32_t j = i_end, j_end = n - j < width ? n : j + width, k = begin;
+
+			while (i < i_end && j < j_end) {
+				bool later = from[j].key < from[i].key;
+
+				to[k++] = from[later ? j : i];
+				i += !later;
+				j += later;
+			}
+			while (i < i_end)
+				to[k++] = from[i++];
+			while (j < j_end)
+				to[k++] = from[j++];
+		}
+	return from;
 }
 
 void fold_apply(struct fold *fold)
 {
+	const struct turn *turn;
+
 	rays_walk(fold);
 	for (uint32_t i = 0; i < fold->used; i++)
 		fold->slot[fold->block[i]->slot] = 0;
-	qsort(fold->block, fold->used, sizeof(struct scratch_block *), compare_blocks);
+	turn = turns_sort(fold);
 	for (uint32_t i = 0; i < fold->used; i++) {
-		struct block *block = grid_touch(fold->grid, fold->block[i]->key);
+		struct block *block = block_touch(fold, turn[i].block->key);
 
 		if (block)
-			block_fold(fold, block, fold->block[i]);
+			block_fold(fold, block, turn[i].block);
 		else
-			block_drop(fold->block[i]);
+			block_drop(turn[i].block);
 	}
 	fold->used = 0;
 	fold->samples = 0;
+	fold->slabs = 0;
+	fold->column = fold->column_end = NULL;
 	memset(fold->recent, 0, sizeof(fold->recent));
 }
 

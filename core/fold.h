@@ -13,8 +13,9 @@
 #define TOUCHING        24     /* 1/256 cell: a mean no farther behind a surface is published as 0, on it */
 #define TOUCHING_STICKS 8      /* more on the side where a voxel is, less where it is not yet */
 #define FREE_WEIGHT     32     /* what one ray takes from a voxel it passes through */
-#define FOLD_BLOCKS_MAX 4096   /* blocks of one row (34 MB); when they are full the row is folded in parts */
+#define FOLD_BLOCKS_MAX 4096   /* blocks of one row (15 MB); when they are full the row is folded in parts */
 #define FOLD_RAYS_MAX   65536  /* distinct rays of one row; rays beyond are not looked at */
+#define FOLD_PATCH_SIDE 32     /* samples along one side of a patch */
 #define RAY_LENGTH_MAX  8192.0 /* cells; a longer ray clears nothing */
 
 struct fold;
@@ -25,12 +26,13 @@ void fold_destroy(struct fold *);
 
 /* A piece of plane, prepared once for all its samples. */
 struct fold_plane {
-	double n[3];    /* towards the scanner, unit length */
-	double inverse; /* 1 / n[axis] */
-	double half;    /* voxels along the axis on either side */
-	int32_t step;   /* distance from voxel to voxel along the axis, 1/65536 cell */
-	int32_t weight; /* 4 w / (256 BAND_CELLS), in 1/65536 */
-	int axis;       /* the dominant one, 0..2 */
+	double n[3]; /* towards the scanner, unit length; along the axis, then the lesser and the greater other one */
+	double inverse;                            /* 1 / n[0] */
+	double half;                               /* voxels along the axis on either side */
+	int32_t step;                              /* distance from voxel to voxel along the axis, 1/65536 cell */
+	int16_t high[BLOCK_SIDE], low[BLOCK_SIDE]; /* i steps: in 1/256 cell, and what is left */
+	int16_t weight[BLOCK_SIDE];                /* 4 w / (256 BAND_CELLS), in 1/65536, eight times */
+	int axis;                                  /* the dominant one, 0..2 */
 };
 
 /* `weight` of a sample right on a voxel is 4 * weight, at most 32 * 4. */
@@ -38,6 +40,9 @@ struct fold_plane fold_plane(struct vec3 normal, double weight);
 
 /* Adds a sample: the voxels of the column nearest to `point` (cells, within the map) along the plane's axis. */
 void fold_sample(struct fold *, const struct fold_plane *, struct vec3 point);
+
+/* Adds across * along samples, each at most FOLD_PATCH_SIDE, spread evenly over the patch with corners 0 1 / 2 3. */
+void fold_patch(struct fold *, const struct fold_plane *, const struct vec3 corner[4], int across, int along);
 
 /* A ray that passes through free space from `origin` to `end`. Rays that end in one voxel are one ray with their count.
  */

@@ -296,20 +296,12 @@ int16_t grid_published(const struct grid *grid, int32_t i, int32_t j, int32_t k)
 
 static int lowest_bit(uint8_t bits)
 {
-	int b = 0;
-
-	while (!(bits >> b & 1))
-		b++;
-	return b;
+	return __builtin_ctz(bits);
 }
 
 static int highest_bit(uint8_t bits)
 {
-	int b = 7;
-
-	while (!(bits >> b & 1))
-		b--;
-	return b;
+	return 31 - __builtin_clz(bits);
 }
 
 void grid_mark_changed(struct grid *grid, struct block_key key, const uint8_t layers[3])

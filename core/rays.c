@@ -100,61 +100,54 @@ static void block_pass(struct fold *fold, const struct block *block, const struc
 	} while ((uint32_t)(w.cell[axis] - low[axis]) < BLOCK_SIDE);
 }
 
-/* The block at a key, or NULL, remembered: neighbouring rays ask for the same ones, and the grid does not change meanwhile. */
-struct memory {
-	struct block_key key;
-	bool known;
-	const struct block *block;
-};
-
-#define MEMORY_SIZE 512
-
-static const struct block *memory_find(struct memory *memory, const struct grid *grid, const int32_t cell[3])
+/* The blocks of a line, without a branch but the one for a block that may matter: which axis comes next is a matter of chance
+ * that no processor guesses. Adding nothing leaves a number as it is, so every crossing is the sum of the same steps. */
+static void blocks_walk(struct fold *fold, const struct line *l, const struct walk *begin, uint32_t count)
 {
-	struct memory *m = &memory[(cell[0] & 7) | (cell[1] & 7) << 3 | (cell[2] & 7) << 6];
+	const double dx[2] = {0, begin->delta[0]}, dy[2] = {0, begin->delta[1]}, dz[2] = {0, begin->delta[2]};
+	double nx = begin->next[0], ny = begin->next[1], nz = begin->next[2], t = 0, out;
+	int32_t x = begin->cell[0], y = begin->cell[1], z = begin->cell[2];
 
-	if (!m->known || m->key.x != cell[0] || m->key.y != cell[1] || m->key.z != cell[2]) {
-		m->key = (struct block_key){cell[0], cell[1], cell[2]};
-		m->block = grid_find(grid, m->key);
-		m->known = true;
+	for (; t <= 1; t = out) {
+		const int y_first = ny < nx;
+		const double first = ny < nx ? ny : nx;
+		const int to_z = nz < first, to_y = y_first & !to_z, to_x = !(y_first | to_z);
+
+		out = nz < first ? nz : first;
+		if (*hollow_word(fold, y, z) >> (x & (HOLLOW_SIDE - 1)) & 1) {
+			const struct block *block = fold_find(fold, x, y, z);
+
+			if (block && block->layers[0])
+				block_pass(fold, block, l, t, out < 1 ? out : 1, count);
+		}
+		nx += dx[to_x];
+		ny += dy[to_y];
+		nz += dz[to_z];
+		x += begin->step[0] & -to_x;
+		y += begin->step[1] & -to_y;
+		z += begin->step[2] & -to_z;
 	}
-	return m->block;
 }
 
-static void ray_walk(struct fold *fold, struct memory *memory, const struct ray *ray)
+static void ray_walk(struct fold *fold, const struct ray *ray)
 {
 	/* voxels are the cells about corners: half a cell on, floor finds the nearest corner */
 	struct line l = {
 	    .origin = {ray->origin.x + 0.5, ray->origin.y + 0.5, ray->origin.z + 0.5},
 	    .direction = {ray->end.x - ray->origin.x, ray->end.y - ray->origin.y, ray->end.z - ray->origin.z}};
 	struct walk w;
-	double t = 0;
 
 	for (int a = 0; a < 3; a++) {
 		l.inverse[a] = l.direction[a] == 0 ? NEVER : 1 / l.direction[a];
 		walk_axis_begin(&w, &l, a, floor_int(l.origin[a]) >> BLOCK_SHIFT, BLOCK_SIDE);
 	}
-	while (t <= 1) {
-		const struct block *block = memory_find(memory, fold->grid, w.cell);
-		int axis = walk_axis(&w);
-		double out = w.next[axis];
-
-		if (block && block->layers[0])
-			block_pass(fold, block, &l, t, out < 1 ? out : 1, ray->count);
-		t = out;
-		w.next[axis] += w.delta[axis];
-		w.cell[axis] += w.step[axis];
-	}
+	blocks_walk(fold, &l, &w, ray->count);
 }
 
 void rays_walk(struct fold *fold)
 {
-	struct memory memory[MEMORY_SIZE];
-
-	for (int i = 0; i < MEMORY_SIZE; i++)
-		memory[i].known = false;
 	for (uint32_t i = 0; i < fold->rays; i++)
-		ray_walk(fold, memory, &fold->ray[i]);
+		ray_walk(fold, &fold->ray[i]);
 	if (fold->rays)
 		memset(fold->ray_slot, 0, 2 * (size_t)fold->rays_cap * sizeof(*fold->ray_slot));
 	fold->stats.rays += fold->rays;

@@ -4,21 +4,35 @@
 
 #include "core/fold.h"
 
-/* Sums of one voxel in one word: weight * distance in the upper 40 bits, weight in the lower 24. A contribution weighs at
- * most 129, so FOLD_SAMPLES_MAX of them fit; then the row is folded in parts. 0: nothing (a contribution weighs at least 1). */
-typedef int64_t accumulator;
+/* Sums of one voxel in one word: weight * (distance + BAND_UNITS), which is never negative, in the upper 40 bits, weight in
+ * the lower 24. A contribution weighs at most 129, so FOLD_SAMPLES_MAX of them fit; then the row is folded in parts. 0:
+ * nothing (a contribution weighs at least 1). */
+typedef uint64_t accumulator;
 
 #define WEIGHT_BITS      24
+#define BAND_UNITS       (BAND_CELLS * LATTICE)
 #define FOLD_SAMPLES_MAX 130000
 
+/* A sample writes to a column of voxels along x, y or z, eight in one block. The columns of a row lie close together in the
+ * cache, wherever their blocks are. At most 42 MB of them are ever made. */
+struct column {
+	_Alignas(64) accumulator at[BLOCK_SIDE];
+};
+
+#define SAMPLE_COLUMNS  3 /* that a sample writes to: its band is at most 11 voxels long */
+#define COLUMNS_AT_HAND (BLOCK_SIDE * BLOCK_SIDE)
+#define SLAB_COLUMNS    1024
+#define SLABS_MAX \
+	((SAMPLE_COLUMNS * FOLD_SAMPLES_MAX + FOLD_BLOCKS_MAX * COLUMNS_AT_HAND) / (SLAB_COLUMNS - COLUMNS_AT_HAND) + 2)
+
+/* Column c of an axis: the lesser of the other two coordinates in bits 0..2 of c, the greater one in bits 3..5. */
 struct scratch_block {
 	struct block_key key;
 	uint32_t slot;
-	uint64_t seen[BLOCK_SIDE];   /* bit y * 8 + x of word z: got surface weight, columns along z apart */
-	uint64_t columns;            /* bit y * 8 + x: somewhere in this column along z there is surface weight */
-	uint64_t passed[BLOCK_SIDE]; /* as `seen`: a ray took weight */
-	accumulator at[BLOCK_VOXELS];
-	uint32_t rays[BLOCK_VOXELS]; /* that passed through */
+	uint64_t seen[3];                                  /* bit c: column c of this axis got surface weight */
+	struct column *column[3][BLOCK_SIDE * BLOCK_SIDE]; /* where seen */
+	uint64_t passed[BLOCK_SIDE];                       /* bit y * 8 + x of word z: a ray took weight */
+	uint32_t rays[BLOCK_VOXELS];                       /* that passed through */
 };
 
 struct ray {
@@ -27,9 +41,25 @@ struct ray {
 	uint32_t count;
 };
 
+/* Blocks of a row in the order in which they are folded. */
+struct turn {
+	uint64_t key;
+	struct scratch_block *block;
+};
+
+#define FOUND_SIZE  512 /* 8 x 8 x 8 neighbours never evict each other */
+#define HOLLOW_SIDE 64  /* blocks */
+
 struct fold {
 	struct grid *grid;
-	struct scratch_block **block; /* in order of their making; allocated ones stay */
+	struct block *found[FOUND_SIZE]; /* of the grid, whose blocks never move */
+	/* Bit x of word z, y (each modulo its number): a block there has, or once had, a negative voxel. */
+	uint64_t hollow[HOLLOW_SIDE / 4][HOLLOW_SIDE];
+	struct column *slab[SLABS_MAX];     /* allocated ones stay, all zero between rows */
+	struct column *column, *column_end; /* the next ones, in the last slab in use */
+	uint32_t slabs;                     /* in use */
+	struct turn *turn;                  /* [2 * FOLD_BLOCKS_MAX] */
+	struct scratch_block **block;       /* in order of their making; allocated ones stay */
 	uint32_t used, made;
 	uint32_t samples;                /* since the last fold */
 	uint32_t *slot;                  /* block number + 1, 0: empty */
@@ -48,6 +78,14 @@ static inline struct scratch_block *scratch_touch(struct fold *fold, int32_t x, 
 	struct scratch_block *b = fold->recent[(x & 1) | (y & 1) << 1 | (z & 1) << 2];
 
 	return b && b->key.x == x && b->key.y == y && b->key.z == z ? b : scratch_seek(fold, x, y, z);
+}
+
+/* A block of the grid, or NULL. */
+struct block *fold_find(struct fold *, int32_t x, int32_t y, int32_t z);
+
+static inline uint64_t *hollow_word(struct fold *fold, int32_t y, int32_t z)
+{
+	return &fold->hollow[z & (HOLLOW_SIDE / 4 - 1)][y & (HOLLOW_SIDE - 1)];
 }
 
 /* Walks every ray through the blocks that exist and marks the voxels it may clear; no ray is left. */

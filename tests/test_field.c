@@ -296,6 +296,73 @@ static void a_crowd_of_points_in_one_place_does_not_overflow(void **state)
 	rig_end(&rig);
 }
 
+static void weights_add(void *ctx, struct block *block)
+{
+	for (int i = 0; i < BLOCK_VOXELS; i++)
+		*(uint64_t *)ctx += block->voxel[i].weight;
+}
+
+/* Bands that reach over a block's border, in more blocks than there is scratch for. */
+static void a_full_scratch_is_folded_and_nothing_is_lost(void **state)
+{
+	enum { N = 3 * FOLD_BLOCKS_MAX / 4 };
+	struct rig rig = {.grid = grid_create(MEMORY)};
+	struct fold *fold = fold_create(rig.grid);
+	struct fold_plane plane = fold_plane((struct vec3){0, 1, 0}, 32);
+	uint64_t one = 0, all = 0;
+	struct grid_stats stats;
+
+	(void)state;
+	fold_sample(fold, &plane, (struct vec3){4, 7.5, 4});
+	fold_apply(fold);
+	grid_each(rig.grid, weights_add, &one);
+	for (int n = 1; n < N; n++)
+		fold_sample(fold, &plane, (struct vec3){4 + 16 * (n % 64), 7.5, 4 + 16 * (n / 64)});
+	fold_apply(fold);
+	grid_each(rig.grid, weights_add, &all);
+	grid_stats(rig.grid, &stats);
+	assert_int_equal(stats.blocks, 2 * N);
+	assert_true(one > 0);
+	assert_int_equal(all, N * one);
+	fold_destroy(fold);
+	grid_destroy(rig.grid);
+}
+
+/* Also where bands along several axes meet in one block. */
+static void a_patch_is_the_sum_of_its_samples(void **state)
+{
+	const struct vec3 normal[3] = {{0.9, 0.3, -0.316}, {-0.2, -0.8, 0.566}, {0.577, 0.577, 0.578}};
+	const struct vec3 corner[4] = {{-3, 2, 1}, {2.5, 3, 0.5}, {-2.7, -4, 2}, {3, -3.5, 5}};
+	uint64_t hash[2];
+
+	(void)state;
+	for (int single = 0; single < 2; single++) {
+		struct rig rig = {.grid = grid_create(MEMORY)};
+		struct fold *fold = fold_create(rig.grid);
+
+		for (int k = 0; k < 3; k++) {
+			struct fold_plane plane = fold_plane(normal[k], 20);
+			const int across = 7 + k, along = FOLD_PATCH_SIDE;
+
+			if (!single)
+				fold_patch(fold, &plane, corner, across, along);
+			for (int i = 0; single && i < across * along; i++) {
+				double v = (i / across + 0.5) / along;
+				struct vec3 left = vec3_lerp(corner[0], corner[2], v);
+
+				fold_sample(
+				    fold, &plane,
+				    vec3_lerp(left, vec3_lerp(corner[1], corner[3], v), (i % across + 0.5) / across));
+			}
+		}
+		fold_apply(fold);
+		hash[single] = voxels_hash(&rig);
+		fold_destroy(fold);
+		grid_destroy(rig.grid);
+	}
+	assert_true(hash[0] == hash[1]);
+}
+
 /* However the end of a sweep becomes known, its rows see the same neighbours. */
 static void a_row_that_waited_gives_the_same_voxels(void **state)
 {
@@ -621,6 +688,8 @@ int main(void)
 	    cmocka_unit_test(rays_of_one_row_that_end_together_are_one_with_their_count),
 	    cmocka_unit_test(at_the_cap_sum_and_weight_shrink_together),
 	    cmocka_unit_test(a_crowd_of_points_in_one_place_does_not_overflow),
+	    cmocka_unit_test(a_full_scratch_is_folded_and_nothing_is_lost),
+	    cmocka_unit_test(a_patch_is_the_sum_of_its_samples),
 	    cmocka_unit_test(a_row_that_waited_gives_the_same_voxels),
 	    cmocka_unit_test(lookahead_says_how_many_rows_wait),
 	    cmocka_unit_test(meshing_in_between_leaves_no_trace),

@@ -283,8 +283,9 @@ void control_put_status(struct buffer *b, const struct control_status *s)
 	                              (json_int_t)s->encoded_bytes, "pinned", (json_int_t)s->pinned_bytes, "rss",
 	                              (json_int_t)s->rss_bytes));
 	json_object_set_new(json, "queue",
-	                    json_pack("{s:I, s:I, s:I}", "length", (json_int_t)s->worker.queued, "peak",
-	                              (json_int_t)s->worker.queued_peak, "cap", (json_int_t)s->worker.rows_max));
+	                    json_pack("{s:I, s:I, s:I, s:b}", "length", (json_int_t)s->worker.queued, "peak",
+	                              (json_int_t)s->worker.queued_peak, "cap", (json_int_t)s->worker.rows_max, "idle",
+	                              s->worker.idle));
 	json_object_set_new(json, "latency_ms",
 	                    json_pack("{s:f, s:f, s:I}", "p50", s->latency_p50_ms, "p99", s->latency_p99_ms, "n",
 	                              (json_int_t)s->latencies));

@@ -28,9 +28,10 @@
 #include "daemon/wall_clock.h"
 #include "daemon/web_native.h"
 
-#define TICK_MS 100
-#define STEP_NS 1000000 /* the wall clock was set if it is off by more */
-#define LAST_MS 1000
+#define TICK_MS    100
+#define STEP_NS    1000000 /* the wall clock was set if it is off by more */
+#define LAST_MS    1000
+#define STREAMS_MS 20 /* until it is looked again whether clients have their recordings whole */
 
 int64_t daemon_now(void *ctx)
 {
@@ -159,6 +160,15 @@ void daemon_wake_devices(struct daemon *d, int64_t wait_ns)
 	uv_timer_start(&d->devices, on_devices, wait_ns <= 0 ? 0 : (uint64_t)(wait_ns + 999999) / 1000000, 0);
 }
 
+/* Clients that take a recording get its end first; one that does not read is waited for until on_last. */
+static void close_in_order(struct daemon *d)
+{
+	if (d->server && server_end_streams(d->server) > 0)
+		uv_timer_start(&d->devices, on_devices, STREAMS_MS, 0);
+	else
+		close_all(d);
+}
+
 /* One timer for the nearest deadline of all devices. */
 static void set_device_timer(struct daemon *d)
 {
@@ -172,7 +182,7 @@ static void set_device_timer(struct daemon *d)
 	if (d->closed)
 		return;
 	if (d->stopping && supervisor_stopped(d->supervisor))
-		close_all(d);
+		close_in_order(d);
 	else if (deadline_ns == INT64_MAX)
 		uv_timer_stop(&d->devices);
 	else

@@ -20,8 +20,10 @@ static bool save(struct daemon *d, const char *file, char error[200])
 static bool snapshot(void *ctx, struct recording_begin *ret, struct buffer *ret_bytes)
 {
 	struct daemon *d = ctx;
+	const int64_t log_ns = pipeline_log_ns(d->pipeline);
 
-	ret->log_ns = daemon_now(d);
+	/* Not now: the tick or the record that is being handled is dated already, and its time would have to be put off. */
+	ret->log_ns = log_ns ? log_ns : daemon_now(d);
 	ret->generation = d->list_generation;
 	memcpy(ret->map_id, d->list_map_id, sizeof(ret->map_id));
 	return journal_snapshot(d->pipeline, ret_bytes) == 0;

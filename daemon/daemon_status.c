@@ -135,6 +135,7 @@ static void fill_status(struct daemon *d, struct control_client client[CLIENTS_S
 	s.rows.assembled = rows.rows;
 	s.rows.applied = d->field.step;
 	s.rows.not_applied = rows.not_applied;
+	s.worker.idle &= !rows.looks_ahead;
 	s.rows.queue_full = d->queue_full;
 	s.rows.paused = d->rows_paused;
 	s.rows.sweep = rows.sweep;

@@ -9,8 +9,8 @@
  *
  * Nothing here looks at a clock. What changes the map hangs on records and ticks alone, so a kept list of them gives
  * the same rows again (law L7); the only thing a replay must be told besides is which rows the sink had refused. That
- * is why a refused row keeps its number, and why the second without a row, after which the look-ahead is folded, counts
- * from rows assembled, refused ones too. A list that begins in mid-session begins with a snapshot (pipeline_state). */
+ * is why a refused row keeps its number. The second after which the look-ahead is folded is one without a row that was
+ * taken, so that a map which takes no more of them (a pause) is complete a second later and then stands. A list that begins in mid-session begins with a snapshot (pipeline_state). */
 #include "daemon/pipeline.h"
 
 #include <assert.h>
@@ -178,8 +178,6 @@ static void hand_out(struct pipeline *p, struct scanner *scanner, struct row *ro
 	row->starts_sweep = begins;
 	scanner->begins = false;
 	p->rows++;
-	p->last_row_ns = p->log_ns;
-	p->rows_since_flush = true;
 	p->arrival_ns = arrival_of(p, scanner, row->t_ns);
 	if (skipped(p, number)) {
 		row_destroy(row);
@@ -189,6 +187,9 @@ static void hand_out(struct pipeline *p, struct scanner *scanner, struct row *ro
 		row_destroy(row);
 		scanner->begins = begins;
 		report_not_applied(p, number, "queue full");
+	} else {
+		p->last_row_ns = p->log_ns;
+		p->rows_since_flush = true;
 	}
 }
 
@@ -514,11 +515,17 @@ void pipeline_destroy(struct pipeline *p)
 	free(p);
 }
 
+int64_t pipeline_log_ns(const struct pipeline *p)
+{
+	return p->log_ns;
+}
+
 void pipeline_stats(const struct pipeline *p, struct pipeline_stats *ret)
 {
 	memset(ret, 0, sizeof(*ret));
 	ret->rows = p->rows;
 	ret->not_applied = p->not_applied;
+	ret->looks_ahead = p->rows_since_flush;
 	for (int i = 0; i < p->scanners; i++) {
 		struct sweep_stats one;
 

@@ -20,7 +20,7 @@ struct pipeline_sink {
 	bool (*row)(void *ctx, struct row *row);
 	/* Row `number` will not be applied: an event for the recording. May be NULL. */
 	void (*not_applied)(void *ctx, uint64_t number, const char *reason);
-	/* A second of recorded time passed without a row: what waits for its look-ahead is folded now. */
+	/* A second of recorded time passed without a row that was taken: what waits for its look-ahead is folded now. */
 	void (*flush)(void *ctx);
 	/* Replies and signs of life for the devices' dialogues. May be NULL (replay). */
 	void (*reply)(void *ctx, int device, const struct reply *);
@@ -50,11 +50,15 @@ void pipeline_reset(
  * skip. A load that fails says why and leaves the pipeline as new; the map that belongs to it is the caller's. */
 void pipeline_state(struct pipeline *, struct state *, char error[160]);
 
+/* Log time of what was handled last; 0: nothing was. */
+int64_t pipeline_log_ns(const struct pipeline *);
+
 /* Within the sink's `row`: log time of the last byte of the profile that the row is made of. */
 int64_t pipeline_arrival_ns(const struct pipeline *);
 
 struct pipeline_stats {
 	uint64_t rows, not_applied;
+	bool looks_ahead;         /* rows may wait for their look-ahead: no flush since the last one that was taken */
 	struct sweep_stats sweep; /* summed over the scanners */
 };
 void pipeline_stats(const struct pipeline *, struct pipeline_stats *ret);

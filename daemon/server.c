@@ -53,6 +53,7 @@ struct connection {
 	size_t out_at;
 	uint64_t sent;
 	struct publisher_client *client; /* native only */
+	bool takes;                      /* a recording, or what is left of it: not closed before it is written out */
 	struct recorder *stream;         /* lines only: `out` is pieces of a recording from now on */
 };
 
@@ -78,7 +79,7 @@ struct server {
 	struct connection *connections;
 	size_t count; /* of connections, those that are told to go included */
 	uint64_t next_id;
-	bool stopped;
+	bool stopped, ending;
 };
 
 /* Closing */
@@ -130,7 +131,7 @@ static void end_stream(struct connection *c, const char *reason)
 
 	s->host.stream_end(s->host.ctx, c->stream);
 	c->stream = NULL;
-	control_put_end(&text, reason);
+	control_put_end(&text, s->ending ? "the daemon ends" : reason);
 	buffer_append(&c->out, text.data, text.len);
 	buffer_append(&c->out, "\n", 1);
 	buffer_finish(&text);
@@ -324,6 +325,7 @@ static void begin_stream(struct connection *c, const struct control_command *com
 		say_error(c, error);
 		return;
 	}
+	c->takes = true;
 	c->watches = false;
 	control_put_answer(&text, command);
 	put_line(c, &text);
@@ -690,6 +692,19 @@ void server_streams(struct server *s)
 		if (c->stream && !(c->events & UV_WRITABLE))
 			pump(c);
 	}
+}
+
+size_t server_end_streams(struct server *s)
+{
+	size_t left = 0;
+
+	s->ending = true;
+	for (struct connection *c = s->connections; c; c = c->next) {
+		if (c->stream)
+			recorder_enable(c->stream, false);
+		left += c->takes;
+	}
+	return left;
 }
 
 void server_event(struct server *s, const char *text, size_t len)

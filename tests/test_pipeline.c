@@ -456,6 +456,33 @@ static void a_second_without_a_row_flushes_once(void **state)
 	close_outcome(&o);
 }
 
+/* A map that takes no more rows is complete a second later, although the scanner goes on. */
+static void rows_that_are_refused_do_not_put_the_flush_off(void **state)
+{
+	struct pipeline_stats stats;
+	struct outcome o;
+
+	(void)state;
+	open_outcome(&o);
+	play(&o, 6000 * MS, 2);
+	pipeline_stats(o.pipeline, &stats);
+	assert_true(stats.looks_ahead);
+	o.refuse_from = o.rows;
+	o.refuse_to = 1000;
+	play(&o, 6500 * MS, 2);
+	tick(&o, 7025 * MS);
+	terminate(&o);
+	assert_int_equal(count(&o, "flush"), 0);
+	tick(&o, 7027 * MS);
+	play(&o, 8500 * MS, 2);
+	tick(&o, 9600 * MS);
+	terminate(&o);
+	assert_int_equal(count(&o, "flush"), 1);
+	pipeline_stats(o.pipeline, &stats);
+	assert_false(stats.looks_ahead);
+	close_outcome(&o);
+}
+
 static void latency_counts_from_the_last_byte_of_the_rows_own_profile(void **state)
 {
 	struct outcome o;
@@ -920,6 +947,7 @@ int main(void)
 	    cmocka_unit_test(a_row_lost_to_want_of_memory_costs_one_number_and_a_replay_keeps_step),
 	    cmocka_unit_test(an_angle_reaches_only_the_scanner_on_that_servo),
 	    cmocka_unit_test(a_second_without_a_row_flushes_once),
+	    cmocka_unit_test(rows_that_are_refused_do_not_put_the_flush_off),
 	    cmocka_unit_test(latency_counts_from_the_last_byte_of_the_rows_own_profile),
 	    cmocka_unit_test(replies_and_counters_are_those_of_their_device),
 	    cmocka_unit_test(a_kept_list_gives_the_same_rows_again_also_from_mid_session_on),

@@ -352,15 +352,8 @@ void cubes_gather(const struct grid *grid, struct patch_key key, struct window *
 
 static_assert(VERTEX_NAMES < UINT16_MAX, "a vertex index of a raw patch fits 16 bits");
 
-struct active_cell {
-	uint16_t i, j, k;
-	uint8_t code;
-};
-
 struct extraction {
 	const struct window *window;
-	struct active_cell *cell;
-	uint32_t cells, triangles;
 	uint16_t *index; /* [VERTEX_NAMES] vertex of a name + 1, or 0: none so far; rows without cells are not set */
 };
 
@@ -374,45 +367,26 @@ static uint32_t count_cells(const struct window *window)
 	uint32_t n = 0;
 	for (int k = 0; k < PATCH_SIDE; k++)
 		for (int j = 0; j < PATCH_SIDE; j++)
-			for (uint32_t active = own_active(window, j, k); active; active &= active - 1)
-				n++;
+			n += (uint32_t)__builtin_popcount(own_active(window, j, k));
 	return n;
 }
 
-static uint8_t case_triangles(uint8_t code)
-{
-	uint8_t n = 0;
-	while (n < 15 && cubes_triangles[code][n] >= 0)
-		n += 3;
-	return n / 3;
-}
-
-/* Lists the cells with a surface in canonical order (z, then y, then x). */
-static void list_cells(struct extraction *x)
-{
-	for (int k = 0; k < PATCH_SIDE; k++)
-		for (int j = 0; j < PATCH_SIDE; j++) {
-			const uint32_t *in = &x->window->inside[window_row(j, k)];
-			const uint32_t rows[4] = {in[0], in[1], in[WINDOW_SIDE], in[WINDOW_SIDE + 1]};
-			for (uint32_t active = own_active(x->window, j, k); active; active &= active - 1) {
-				int i = __builtin_ctz(active), b = i + WINDOW_LOW;
-				uint8_t code = (uint8_t)((rows[0] >> b & 3) | (rows[1] >> b & 3) << 2 |
-				                         (rows[2] >> b & 3) << 4 | (rows[3] >> b & 3) << 6);
-				x->cell[x->cells++] = (struct active_cell){(uint16_t)i, (uint16_t)j, (uint16_t)k, code};
-				x->triangles += case_triangles(code);
-			}
-		}
-}
-
-/* No vertex has a name yet, in the rows that cells will look at. */
+/* No vertex has a name yet: of each layer from the first row that a cell will look at to the last. */
 static void forget_names(const struct window *window, uint16_t *index)
 {
-	for (int k = 0; k <= PATCH_SIDE; k++)
+	for (int k = 0; k <= PATCH_SIDE; k++) {
+		int first = PATCH_SIDE + 1, end = 0;
 		for (int j = 0; j <= PATCH_SIDE; j++) {
 			const uint32_t *active = &window->active[window_row(j, k)];
-			if (active[0] | active[-1] | active[-WINDOW_SIDE] | active[-WINDOW_SIDE - 1])
-				memset(&index[vertex_name(0, j, k, 0)], 0, ROW_NAMES * sizeof *index);
+			if (active[0] | active[-1] | active[-WINDOW_SIDE] | active[-WINDOW_SIDE - 1]) {
+				first = j < first ? j : first;
+				end = j + 1;
+			}
 		}
+		if (end > first)
+			memset(&index[vertex_name(0, first, k, 0)], 0,
+			       (size_t)(end - first) * ROW_NAMES * sizeof *index);
+	}
 }
 
 /* Edge e of a cube: the lower corner's offset and the axis (cubes_table.c). */
@@ -425,11 +399,10 @@ static const uint16_t edge_name[12] = {NAME(0, 0, 0, 0), NAME(0, 1, 0, 0), NAME(
                                        NAME(0, 0, 0, 1), NAME(1, 0, 0, 1), NAME(0, 0, 1, 1), NAME(1, 0, 1, 1),
                                        NAME(0, 0, 0, 2), NAME(1, 0, 0, 2), NAME(0, 1, 0, 2), NAME(1, 1, 0, 2)};
 
-static uint32_t make_vertex(struct extraction *x, struct surface *surface, struct active_cell cell, int e,
-                            uint32_t name)
+static uint32_t make_vertex(struct extraction *x, struct surface *surface, const int cell[3], int e, uint32_t name)
 {
 	static const int step[3] = {1, WINDOW_SIDE, WINDOW_SIDE * WINDOW_SIDE};
-	const int at[3] = {cell.i + edge_corner[e][0], cell.j + edge_corner[e][1], cell.k + edge_corner[e][2]};
+	const int at[3] = {cell[0] + edge_corner[e][0], cell[1] + edge_corner[e][1], cell[2] + edge_corner[e][2]};
 	const int axis = e >> 2;
 	const int16_t *value = &x->window->value[window_at(at[0], at[1], at[2])];
 	uint32_t v = surface->nv++;
@@ -441,10 +414,10 @@ static uint32_t make_vertex(struct extraction *x, struct surface *surface, struc
 	return v;
 }
 
-static void extract_cell(struct extraction *x, struct surface *surface, struct active_cell cell)
+static void extract_cell(struct extraction *x, struct surface *surface, const int cell[3], uint8_t code)
 {
-	const int8_t *edge = cubes_triangles[cell.code];
-	const uint32_t own = vertex_name(cell.i, cell.j, cell.k, 0);
+	const int8_t *edge = cubes_triangles[code];
+	const uint32_t own = vertex_name(cell[0], cell[1], cell[2], 0);
 	for (; *edge >= 0; edge += 3, surface->nt++)
 		for (int c = 0; c < 3; c++) {
 			uint32_t name = own + edge_name[edge[c]], v = x->index[name];
@@ -452,37 +425,49 @@ static void extract_cell(struct extraction *x, struct surface *surface, struct a
 		}
 }
 
-/* Memory for what the listed cells give: a triangle makes at most three vertices. */
-static int reserve(struct extraction *x, struct arena *arena, struct surface *ret)
+static void extract_row(struct extraction *x, struct surface *surface, int j, int k)
 {
-	uint32_t vertices = x->triangles * 3 < VERTEX_NAMES ? x->triangles * 3 : VERTEX_NAMES;
+	const uint32_t *in = &x->window->inside[window_row(j, k)];
+	const uint32_t rows[4] = {in[0], in[1], in[WINDOW_SIDE], in[WINDOW_SIDE + 1]};
+	for (uint32_t active = own_active(x->window, j, k); active; active &= active - 1) {
+		int i = __builtin_ctz(active), b = i + WINDOW_LOW;
+		uint8_t code = (uint8_t)((rows[0] >> b & 3) | (rows[1] >> b & 3) << 2 | (rows[2] >> b & 3) << 4 |
+		                         (rows[3] >> b & 3) << 6);
+		extract_cell(x, surface, (const int[3]){i, j, k}, code);
+	}
+}
+
+/* Memory for the most that so many cells give: no case has more than five triangles, and a vertex is a crossed edge. */
+static int reserve(struct extraction *x, uint32_t cells, struct arena *arena, struct surface *ret)
+{
+	const uint32_t vertices = cells * 12 < VERTEX_NAMES ? cells * 12 : VERTEX_NAMES;
 	*ret = (struct surface){0};
 	ret->vertex = arena_take(arena, vertices, sizeof *ret->vertex);
 	ret->name = ARENA_TAKE(arena, uint32_t, vertices);
-	ret->triangle = arena_take(arena, x->triangles, sizeof *ret->triangle);
+	ret->triangle = arena_take(arena, cells * 5, sizeof *ret->triangle);
 	x->index = ARENA_TAKE(arena, uint16_t, VERTEX_NAMES);
 	if (!ret->vertex || !ret->name || !ret->triangle || !x->index)
 		return -ENOMEM;
 	return 0;
 }
 
+/* Cells in canonical order: z, then y, then x. */
 int cubes_extract(const struct window *window, struct arena *arena, struct surface *ret)
 {
 	assert(window && arena && ret);
 	struct extraction x = {.window = window};
 	struct surface surface = {0};
-	if (!window->empty) {
-		x.cell = ARENA_TAKE(arena, struct active_cell, count_cells(window));
-		if (!x.cell)
-			return -ENOMEM;
-		list_cells(&x);
-		int r = reserve(&x, arena, &surface);
-		if (r)
-			return r;
-		forget_names(window, x.index);
+	if (window->empty) {
+		*ret = surface;
+		return 0;
 	}
-	for (uint32_t c = 0; c < x.cells; c++)
-		extract_cell(&x, &surface, x.cell[c]);
+	int r = reserve(&x, count_cells(window), arena, &surface);
+	if (r)
+		return r;
+	forget_names(window, x.index);
+	for (int k = 0; k < PATCH_SIDE; k++)
+		for (int j = 0; j < PATCH_SIDE; j++)
+			extract_row(&x, &surface, j, k);
 	*ret = surface;
 	return 0;
 }

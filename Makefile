@@ -189,7 +189,7 @@ soak: all tests
 	@$(B)/tests/test_chaos 3600
 	@tests/soak $(B)
 	@echo '200 kills while recording:'
-	@FACET_BUILD=$(B) tests/e2e_recorded_killed.sh 200
+	@tests/soak $(B) kills 200
 
 FUZZ_SECONDS ?= 300
 fuzz:

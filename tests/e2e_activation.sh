@@ -1,14 +1,12 @@
 #!/bin/sh
 # Law: a socket that systemd opened is served as it is and outlives the daemon; one that the configuration does not name is
 # not served, and the log says so. Sockets are passed by hand, as sd_listen_fds(3) describes it.
-cd "$(dirname "$0")/.." || exit 2
+. "$(dirname "$0")/lib.sh"
 if ! command -v python3 >/dev/null 2>&1; then
     echo "python3 is not here: install it (make deps)"
     exit 77
 fi
-scratch=$(mktemp -d)
-trap 'rm -rf "$scratch"' EXIT
-exec timeout -k 5 120 python3 - "${FACET_BUILD:-build}" "$scratch" <<'END'
+timeout -k 5 120 python3 - "$build" "$scratch" <<'END'
 import json, os, signal, socket, sys, time
 
 build, scratch = sys.argv[1:]

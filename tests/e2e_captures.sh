@@ -1,33 +1,13 @@
 #!/bin/sh
 # Law: what real scanners sent arrives through the whole daemon as it does in the decoder: over TCP, after the daemon's own
 # dialogue, every scan of a capture is a profile, and nothing else is.
-cd "$(dirname "$0")/.." || exit 2
-build=$PWD/${FACET_BUILD:-build}
+. "$(dirname "$0")/lib.sh"
 captures=../shared/data/captures
 [ -e "$captures/cola_b/lms111_20210302.txt" ] || { echo "the captures are not here: $captures"; exit 77; }
 command -v python3 >/dev/null 2>&1 || { echo "python3 is not here: install it (make deps)"; exit 77; }
-scratch=$(mktemp -d)
-peer='' daemon='' simulator=''
-unset FACETD XDG_RUNTIME_DIR FACETD_CONFIG
-finish() {
-    for pid in $daemon $peer $simulator; do kill -KILL "$pid" 2>/dev/null; done
-    wait 2>/dev/null
-    daemon='' peer='' simulator=''
-}
-trap 'finish; rm -rf "$scratch"' EXIT
-trap 'exit 1' INT TERM
-failed=0
-
-until_true() { # COMMAND...: tried five times a second for a minute
-    end=$(($(date +%s) + 60))
-    while ! "$@"; do
-        [ "$(date +%s)" -lt $end ] || return 1
-        sleep 0.2
-    done
-}
 
 counts() { # NAME VALUE...: the scanner's counters have them; else says which do not
-    timeout 20 "$build/facet" watch --once --json "unix:$scratch/facetd.sock" 2>/dev/null | python3 -c '
+    timeout 20 "$facet" watch --once --json "unix:$scratch/facetd.sock" 2>/dev/null | python3 -c '
 import json, sys
 devices = {device["name"]: device for device in json.loads(sys.stdin.readline())["devices"]}
 counters, wanted = devices["laser"]["counters"], sys.argv[1:]
@@ -43,28 +23,26 @@ has() {
 # A captured telegram of an LMS200 in the place of a simulated one's first measurements.
 play_lms200() {
     rm -f "$scratch"/*.log
-    "$build/facet" simulate hall --dir "$scratch/sim" >"$scratch/simulator.log" 2>&1 &
-    simulator=$!
+    "$facet" simulate hall --dir "$scratch/sim" >"$scratch/simulator.log" 2>&1 &
     wrong="the simulator does not come up"
-    until_true [ -e "$scratch/sim/laser" ] || return 1
+    until_true 60 [ -e "$scratch/sim/laser" ] || return 1
     python3 tests/lms2xx_peer.py "$scratch/sim/laser" "$scratch/line" "$captures/lms2xx/lms200_b0_361_mm_real.bin" 20 >"$scratch/peer.log" 2>&1 &
-    peer=$!
     wrong="the peer does not come up"
-    until_true [ -e "$scratch/line" ] || return 1
+    until_true 60 [ -e "$scratch/line" ] || return 1
     cat >"$scratch/facetd.yaml" <<YAML
 devices:
   - {name: laser, driver: lms2xx, port: "$scratch/line", baud: 38400, variant: 180/0.5, tilt: 0deg}
   - {name: robot, driver: pose, fixed: {xyz: [0, 0, 0], rpy: [0, 0, 0]}}
 listen: {native: ["unix:$scratch/facetd.sock"]}
 YAML
-    "$build/facetd" --config "$scratch/facetd.yaml" 2>"$scratch/daemon.log" &
+    "$facetd" --config "$scratch/facetd.yaml" 2>"$scratch/daemon.log" &
     daemon=$!
     wrong="the daemon does not ask for measurements"
-    until_true grep -q played "$scratch/peer.log" || return 1
+    until_true 60 grep -q played "$scratch/peer.log" || return 1
     set -- profiles 20 malformed 0 'raster unknown' 0 'mode unknown' 0 'mode without ranges' 0
-    until_true has "$@"
+    until_true 60 has "$@"
     wrong=$(counts "$@") || return 1
-    finish
+    end_all
     summary="$summary lms200 20"
 }
 
@@ -75,21 +53,20 @@ play_once() { # as play; 1: see $wrong
     shift 3
     rm -f "$scratch/port" "$scratch"/*.log "$scratch/facetd.sock"
     python3 tests/cola_peer.py "$captures/$capture" "$scratch/port" >"$scratch/peer.log" 2>&1 &
-    peer=$!
     wrong="the peer does not come up"
-    until_true [ -e "$scratch/port" ] || return 1
+    until_true 60 [ -e "$scratch/port" ] || return 1
     cat >"$scratch/facetd.yaml" <<YAML
 devices:
   - {name: laser, driver: $driver, connect: "127.0.0.1:$(cat "$scratch/port")", tilt: 0deg$more}
   - {name: robot, driver: pose, fixed: {xyz: [0, 0, 0], rpy: [0, 0, 0]}}
 listen: {native: ["unix:$scratch/facetd.sock"]}
 YAML
-    "$build/facetd" --config "$scratch/facetd.yaml" 2>"$scratch/daemon.log" &
+    "$facetd" --config "$scratch/facetd.yaml" 2>"$scratch/daemon.log" &
     daemon=$!
     wrong="the daemon does not take it to its end"
-    until_true grep -q played "$scratch/peer.log" || return 1
+    until_true 60 grep -q played "$scratch/peer.log" || return 1
     set -- profiles "$profiles" 'check sum' 0 malformed 0 implausible 0 'scans lost' 0 'too long' 0 'bad start' 0 "$@"
-    until_true has "$@"
+    until_true 60 has "$@"
     sleep 0.5 # nothing comes twice
     wrong=$(counts "$@") || return 1
     wrong="the daemon did not say that it streams"
@@ -103,11 +80,11 @@ YAML
 play() { # CAPTURE DRIVER PROFILES [NAME VALUE]...; $more: keys of the device
     for try in 1 2 3; do
         if play_once "$@"; then
-            finish
+            end_all
             summary="$summary $(basename "$1") $3"
             return
         fi
-        finish
+        end_all
         # On a busy machine the peer may stand still for so long that the daemon gives it up; then it is played again.
         grep -q 'client went' "$scratch/peer.log" || break
     done

@@ -1,18 +1,10 @@
 #!/bin/sh
 # Law: every decoder of outside bytes has a fuzz target whose kept corpus runs here and reaches at least 90 % of its lines.
-cd "$(dirname "$0")/.." || exit 2
+. "$(dirname "$0")/lib.sh"
 for tool in clang llvm-profdata llvm-cov; do
     command -v $tool >/dev/null 2>&1 || { echo "$tool is not here: install clang and llvm (make deps)"; exit 77; }
 done
 build=build/fuzz
-scratch=$(mktemp -d)
-trap 'rm -rf "$scratch"' EXIT
-failed=0
-
-fail() {
-    echo "FAILED: $*"
-    failed=1
-}
 
 env -u MAKEFLAGS -u MFLAGS -u MAKELEVEL make -s -j2 config=fuzz fuzz-targets || { echo "the fuzz targets do not build"; exit 1; }
 

@@ -1,47 +1,23 @@
 #!/bin/sh
 # Law: other people's readers accept what facetd serves as files, and find in it what the daemon says there is.
-cd "$(dirname "$0")/.." || exit 2
-build=$PWD/${FACET_BUILD:-build}
-out=$(mktemp -d)
-unset FACETD FACETD_CONFIG
-processes=
-cleanup() {
-    for process in $processes; do
-        kill "$process" 2>/dev/null
-    done
-    wait 2>/dev/null
-    rm -rf "$out"
-}
-trap cleanup EXIT
-trap 'exit 1' INT TERM
-failed=0
-
-until_true() { # SECONDS COMMAND...: tried five times a second
-    last=$(($(date +%s) + $1))
-    shift
-    until "$@" 2>/dev/null; do
-        [ "$(date +%s)" -le $last ] || return 1
-        sleep 0.2
-    done
-}
+. "$(dirname "$0")/lib.sh"
 
 command -v curl >/dev/null || {
     echo "curl is not installed"
     exit 77
 }
-tests/npm/install "$build" >"$out/npm" 2>&1 || {
-    tail -n 1 "$out/npm"
+tests/npm/install "$build" >"$scratch/npm" 2>&1 || {
+    tail -n 1 "$scratch/npm"
     exit 77
 }
 
-begins() { # NAME: facetd on $out/NAME.yaml; its page is at $url
-    "$build/facetd" --config "$out/$1.yaml" >"$out/$1.log" 2>&1 &
-    processes="$processes $!"
-    until_true 30 grep -q 'listens on http' "$out/$1.log" || {
-        echo "FAILED: $1 does not listen: $(cat "$out/$1.log")"
+begins() { # NAME: facetd on $scratch/NAME.yaml; its page is at $url
+    "$facetd" --config "$scratch/$1.yaml" >"$scratch/$1.log" 2>&1 &
+    until_true 30 grep -q 'listens on http' "$scratch/$1.log" || {
+        echo "FAILED: $1 does not listen: $(cat "$scratch/$1.log")"
         exit 1
     }
-    url=$(sed -n 's/.*listens on \(http:.*\)/\1/p' "$out/$1.log")
+    url=$(sed -n 's/.*listens on \(http:.*\)/\1/p' "$scratch/$1.log")
 }
 
 status() { # WORD: a number of /status.json
@@ -59,19 +35,18 @@ still() { # the queue is empty and nothing is applied any more
 }
 
 # A part of the demo building, then no more rows.
-"$build/facet" simulate building --dir "$out/robot" -- sleep 300 >/dev/null 2>&1 &
-processes="$processes $!"
-until_true 30 test -s "$out/robot/facetd.yaml" || exit 1
+"$facet" simulate building --dir "$scratch/robot" -- sleep 300 >/dev/null 2>&1 &
+until_true 30 test -s "$scratch/robot/facetd.yaml" || exit 1
 token=0123456789abcdef0123456789abcdef
-(umask 077 && echo $token >"$out/token")
-sed "s|^listen:.*|listen: {native: ['unix:$out/robot.sock'], http: '127.0.0.1:0', token_file: '$out/token'}|" \
-    "$out/robot/facetd.yaml" >"$out/robot.yaml"
+(umask 077 && echo $token >"$scratch/token")
+sed "s|^listen:.*|listen: {native: ['unix:$scratch/robot.sock'], http: '127.0.0.1:0', token_file: '$scratch/token'}|" \
+    "$scratch/robot/facetd.yaml" >"$scratch/robot.yaml"
 begins robot
 until_true 120 beyond step 600 || {
-    echo "FAILED: the robot does not map: $(cat "$out/robot.log")"
+    echo "FAILED: the robot does not map: $(cat "$scratch/robot.log")"
     exit 1
 }
-python3 - "$out/robot.sock" <<'PYTHON' || failed=1
+python3 - "$scratch/robot.sock" <<'PYTHON' || failed=1
 import socket, sys
 with socket.socket(socket.AF_UNIX) as s:
     s.connect(sys.argv[1])
@@ -83,13 +58,13 @@ until_true 30 still || failed=1
 node tests/files_web.mjs "$url" "$build/npm" || failed=1
 
 # A map with nothing in it is a file, too.
-cat >"$out/empty.yaml" <<YAML
+cat >"$scratch/empty.yaml" <<YAML
 devices: [{name: pose, driver: pose, fixed: {xyz: [0, 0, 0], rpy: [0, 0, 0]}}]
-listen: {native: ['unix:$out/empty.sock'], http: '127.0.0.1:0'}
+listen: {native: ['unix:$scratch/empty.sock'], http: '127.0.0.1:0'}
 YAML
 begins empty
-node tests/files_web.mjs "$url" "$build/npm" >"$out/empty.said" || {
+node tests/files_web.mjs "$url" "$build/npm" >"$scratch/empty.said" || {
     failed=1
-    cat "$out/empty.said"
+    cat "$scratch/empty.said"
 }
 exit $failed

@@ -2,38 +2,7 @@
 # Laws L7, L9: a pose that jumps under a running daemon is told to its clients, and what `on_jump` says happens: the map goes on;
 # the old correction is held, as if nothing had been; or a new map begins, the old one is saved whole, and the kept list of
 # each gives it again.
-cd "$(dirname "$0")/.." || exit 2
-build=$PWD/${FACET_BUILD:-build}
-scratch=$(mktemp -d)
-pids=''
-unset FACETD XDG_RUNTIME_DIR FACETD_CONFIG
-cleanup() {
-    for pid in $pids; do kill -KILL "$pid" 2>/dev/null; done
-    wait 2>/dev/null
-    rm -rf "$scratch"
-}
-trap cleanup EXIT
-trap 'exit 1' INT TERM
-failed=0
-
-fail() {
-    echo "FAILED: $*"
-    failed=1
-}
-
-give_up() {
-    fail "$@"
-    cat "$scratch"/*.log
-    exit 1
-}
-
-until_true() { # COMMAND...: tried five times a second for a minute
-    end=$(($(date +%s) + 60))
-    while ! "$@"; do
-        [ "$(date +%s)" -lt $end ] || return 1
-        sleep 0.2
-    done
-}
+. "$(dirname "$0")/lib.sh"
 
 # A localisation whose map is moved under the robot while the file `moved` exists: it stands between the simulated one and the daemon.
 cat >"$scratch/localisation.py" <<'END'
@@ -57,22 +26,6 @@ while True:
         pass
 END
 
-status() { # EXPRESSION over the status s and its devices d: its value
-    timeout 20 "$build/facet" watch --once --json "unix:$dir/facetd.sock" 2>/dev/null | python3 -c '
-import json, sys
-line = sys.stdin.readline()
-if not line: sys.exit(1)
-s = json.loads(line)
-d = {device["name"]: device for device in s["devices"]}
-value = eval(sys.argv[1])
-print(value)
-sys.exit(value is False)' "$1"
-}
-
-holds() {
-    status "$1" >/dev/null
-}
-
 events() { # EXPRESSION over the list of events e: its value
     python3 -c '
 import json, sys
@@ -87,56 +40,41 @@ sees() {
     events "$1" >/dev/null
 }
 
-command() { # WORD
-    python3 -c '
-import socket, sys
-s = socket.socket(socket.AF_UNIX)
-s.connect(sys.argv[1])
-s.sendall((sys.argv[2] + "\n").encode())
-data = b""
-while b"\"OK\"" not in data: data += s.recv(4096)' "$dir/facetd.sock" "$1"
-}
-
 begin() { # ON_JUMP SIMULATE-OPTIONS...: devices, localisation, daemon and a client that watches
     mode=$1
     shift
     dir=$scratch/$mode
+    address=unix:$dir/facetd.sock
     mkdir "$dir" "$dir/archive"
     python3 "$scratch/localisation.py" "$dir/pose.sock" "$dir/moved.sock" "$dir/moved" 2>"$dir/localisation.log" &
-    pids="$pids $!"
-    until_true [ -e "$dir/pose.sock" ] || give_up "no localisation"
-    "$build/facet" simulate hall --endless --dir "$dir" "$@" >"$scratch/$mode.simulator.log" 2>&1 &
-    pids="$pids $!"
-    until_true [ -s "$dir/facetd.yaml" ] || give_up "the simulator does not come up"
+    until_true 60 [ -e "$dir/pose.sock" ] || give_up "no localisation"
+    "$facet" simulate hall --endless --dir "$dir" "$@" >"$scratch/$mode.simulator.log" 2>&1 &
+    until_true 60 [ -s "$dir/facetd.yaml" ] || give_up "the simulator does not come up"
     sed "s|pose.sock\"}|moved.sock\", on_jump: ${mode%-*}}|; \$a map: {archive: \"$dir/archive\"}" "$dir/facetd.yaml" >"$dir/jumps.yaml"
-    "$build/facetd" --config "$dir/jumps.yaml" --journal "$dir/journal" 2>"$scratch/$mode.daemon.log" &
+    "$facetd" --config "$dir/jumps.yaml" --journal "$dir/journal" 2>"$scratch/$mode.daemon.log" &
     daemon=$!
-    pids="$pids $daemon"
-    until_true holds "s['step'] >= 60" || give_up "$mode: no map grows"
-    "$build/facet" watch --json "unix:$dir/facetd.sock" >"$dir/events" 2>"$scratch/$mode.watch.log" &
-    pids="$pids $!"
-    until_true [ -s "$dir/events" ] || give_up "$mode: nothing to watch"
+    until_true 60 holds "s['step'] >= 60" || give_up "$mode: no map grows"
+    "$facet" watch --json "$address" >"$dir/events" 2>"$scratch/$mode.watch.log" &
+    until_true 60 [ -s "$dir/events" ] || give_up "$mode: nothing to watch"
 }
 
 end() {
     kill "$daemon"
     wait "$daemon" || fail "$mode: the daemon ends with $?"
-    for pid in $pids; do kill -KILL "$pid" 2>/dev/null; done
-    wait 2>/dev/null
-    pids=''
+    end_all
 }
 
 # keep: the map goes on, and the way back is told as such.
 begin keep
 map=$(status "s['map'], s['generation']")
 touch "$dir/moved"
-until_true sees "len(e) == 1" || give_up "keep: nobody tells of a jump"
+until_true 60 sees "len(e) == 1" || give_up "keep: nobody tells of a jump"
 events "e[0]['class'] == 'JUMP' and e[0]['device'] == 'pose' and e[0]['done'] == 'keep' and not e[0]['back'] and
         abs(e[0]['angle'] - 0.349) < 0.05 and e[0]['distance'] > 0.5" >/dev/null || fail "keep: $(events e)"
 step=$(status "s['step']")
-until_true holds "s['step'] > $step + 60" || fail "keep: the map stands after a jump"
+until_true 60 holds "s['step'] > $step + 60" || fail "keep: the map stands after a jump"
 rm "$dir/moved"
-until_true sees "len(e) == 2 and e[1]['back']" || fail "keep: the way back: $(events e)"
+until_true 60 sees "len(e) == 2 and e[1]['back']" || fail "keep: the way back: $(events e)"
 [ "$(status "s['map'], s['generation']")" = "$map" ] || fail "keep: another map"
 [ "$(grep -c 'the pose jumped' "$scratch/keep.daemon.log")" = 2 ] || fail "keep: not a line for each jump"
 grep -q 'jumped back by .* degrees: the map goes on' "$scratch/keep.daemon.log" || fail "keep: no line of the way back"
@@ -148,7 +86,7 @@ end
 begin keep-odometry --odometry
 holds "0 <= d['odometry']['sigma']['position'] < 0.2 and d['odometry']['jumps'] == 0" || fail "odometry: $(status "d['odometry']")"
 touch "$dir/moved"
-until_true sees "len(e) == 1 and e[0]['done'] == 'keep' and abs(e[0]['angle'] - 0.349) < 0.02" || fail "odometry: $(events e)"
+until_true 60 sees "len(e) == 1 and e[0]['done'] == 'keep' and abs(e[0]['angle'] - 0.349) < 0.02" || fail "odometry: $(events e)"
 stale=$(status "s['rows']['dropped']['stale pose']")
 python3 - "$dir/simulator.sock" <<'END' >/dev/null || fail "odometry: no fault to be had"
 import socket, sys
@@ -157,10 +95,10 @@ s.connect(sys.argv[1])
 s.sendall(b"odometry: silence for 4s\n")
 print(s.recv(1000))
 END
-until_true holds "s['rows']['dropped']['stale pose'] > $stale + 50" || fail "odometry: rows are placed without a pose"
-until_true holds "d['odometry']['state'] == 'streaming' and d['odometry']['gaps'] >= 1" || fail "odometry: the wheels are not back"
+until_true 60 holds "s['rows']['dropped']['stale pose'] > $stale + 50" || fail "odometry: rows are placed without a pose"
+until_true 60 holds "d['odometry']['state'] == 'streaming' and d['odometry']['gaps'] >= 1" || fail "odometry: the wheels are not back"
 step=$(status "s['step']")
-until_true holds "s['step'] > $step + 60" || fail "odometry: the map stands"
+until_true 60 holds "s['step'] > $step + 60" || fail "odometry: the map stands"
 sees "len(e) == 1" || fail "odometry: corrections are told as jumps: $(events e)"
 echo "note: odometry: $(status "'%.0f mm, %.2f degrees, %d rows dropped in a silence of 4 s' % (1000 * d['odometry']['sigma']['position'], 57.3 * d['odometry']['sigma']['heading'], s['rows']['dropped']['stale pose'])")"
 end
@@ -168,11 +106,12 @@ end
 # ignore: the map stays sound, as if nothing had been.
 begin ignore
 touch "$dir/moved"
-until_true sees "len(e) == 1 and e[0]['done'] == 'ignore'" || fail "ignore: $(events e)"
+until_true 60 sees "len(e) == 1 and e[0]['done'] == 'ignore'" || fail "ignore: $(events e)"
 step=$(status "s['step']")
-until_true holds "s['step'] > $step + 300" || fail "ignore: the map stands after a jump"
-command '?PAUSE'
-timeout 60 "$build/facet" save "unix:$dir/facetd.sock" -o "$dir/held.ply" >/dev/null || fail "ignore: no mesh"
+until_true 60 holds "s['step'] > $step + 300" || fail "ignore: the map stands after a jump"
+say '?PAUSE' >/dev/null
+until_true 60 holds "s['queue']['idle']"
+timeout 60 "$facet" save "$address" -o "$dir/held.ply" >/dev/null || fail "ignore: no mesh"
 # The hall is 15 x 9 m: another frame would put walls elsewhere.
 python3 - "$dir/held.ply" "$scratch/ignore.size" <<'END' || fail "ignore: $(cat "$scratch/ignore.size")"
 import struct, sys
@@ -192,7 +131,7 @@ end
 begin new_map
 map=$(status "s['map']")
 touch "$dir/moved"
-until_true sees "len(e) == 3" || give_up "new_map: $(events e)"
+until_true 60 sees "len(e) == 3" || give_up "new_map: $(events e)"
 events "[x['class'] for x in e] == ['JUMP', 'MAP', 'SAVED'] and e[0]['done'] == 'new_map' and e[1]['before'] == '$map' and
         e[1]['map'] != '$map' and e[1]['generation'] == 2 and e[2]['map'] == '$map' and e[2]['file'] == '$dir/archive/$map.ply'" \
     >/dev/null || fail "new_map: $(events e)"
@@ -201,10 +140,10 @@ holds "s['map'] == '$(events "e[1]['map']")' and s['generation'] == 2" || fail "
 if [ -x ../shared/tools/meshcheck ]; then
     python3 tests/judge.py "$dir/archive/$map.ply" -- "faces>=100" || fail "new_map: the saved map is not sound"
 fi
-until_true holds "s['step'] >= 60" || fail "new_map: the new map does not grow"
-command '?PAUSE'
-sleep 1
-timeout 60 "$build/facet" save "unix:$dir/facetd.sock" -o "$dir/after.ply" >/dev/null || fail "new_map: no mesh after the jump"
+until_true 60 holds "s['step'] >= 60" || fail "new_map: the new map does not grow"
+say '?PAUSE' >/dev/null
+until_true 60 holds "s['queue']['idle']"
+timeout 60 "$facet" save "$address" -o "$dir/after.ply" >/dev/null || fail "new_map: no mesh after the jump"
 end
 if [ -x "$build/tests/test_replay" ]; then
     for list in journal:$dir/archive/$map.ply journal.2:$dir/after.ply; do

@@ -1,10 +1,7 @@
 #!/bin/sh
 # Law: daemon -> drivers -> config -> core, never the other way (design, section 2). One wrong include anywhere is refused.
-cd "$(dirname "$0")/.." || exit 2
+. "$(dirname "$0")/lib.sh"
 tools/lint layers . || { echo "an include points the wrong way"; exit 1; }
-scratch=$(mktemp -d)
-trap 'rm -rf "$scratch"' EXIT
-failed=0
 cp -r core config drivers daemon tools "$scratch"
 for wrong in core/vec.h:config/config.h config/keys.c:drivers/driver.h drivers/table.c:daemon/pipeline.h daemon/worker.c:tools/output.h \
     core/grid.c:daemon/pipeline.h; do

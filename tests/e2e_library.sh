@@ -1,43 +1,13 @@
 #!/bin/sh
 # Law: what a program holds through libfacet or facet.py is the daemon's map: joined late, coded or not, in a box, through a
 # restart of the daemon; and libfacet is a library as installed: a header for C and C++, shared, static, facet_* only.
-cd "$(dirname "$0")/.." || exit 2
-build=$PWD/${FACET_BUILD:-build}
-facet=$build/facet
+. "$(dirname "$0")/lib.sh"
 case $build in
 */build) ;;
 *) echo "only the release's library is linked with other programs"; exit 77 ;;
 esac
 command -v python3 >/dev/null && command -v g++ >/dev/null && command -v pkg-config >/dev/null ||
     { echo "python3, g++ or pkg-config is missing"; exit 77; }
-scratch=$(mktemp -d)
-simulator= follower=
-unset FACETD XDG_RUNTIME_DIR FACETD_CONFIG
-cleanup() {
-    touch "$scratch/stop"
-    # shellcheck disable=SC2086
-    [ -z "$simulator$follower" ] || kill $simulator $follower 2>/dev/null
-    wait 2>/dev/null
-    rm -rf "$scratch"
-}
-trap cleanup EXIT
-trap 'exit 1' INT TERM
-failed=0
-
-fail() {
-    echo "FAILED: $*"
-    failed=1
-}
-
-until_true() { # SECONDS COMMAND...: tried five times a second
-    tries=$(($1 * 5))
-    shift
-    while ! "$@" >/dev/null 2>&1; do
-        tries=$((tries - 1))
-        [ $tries -gt 0 ] || return 1
-        sleep 0.2
-    done
-}
 
 # The library as a user finds it.
 make --no-print-directory install DESTDIR="$scratch/root" PREFIX=/usr >"$scratch/install.log" 2>&1 ||
@@ -99,28 +69,16 @@ while [ ! -e "$1/stop" ]; do
 done
 S
 address=unix:$scratch/run/facetd.sock
-"$facet" simulate hall --endless --dir "$scratch/run" --http 127.0.0.1:0 -- sh "$scratch/daemons" "$scratch" "$build/facetd" >"$scratch/simulator.log" 2>&1 &
-simulator=$!
+"$facet" simulate hall --endless --dir "$scratch/run" --http 127.0.0.1:0 -- sh "$scratch/daemons" "$scratch" "$facetd" >"$scratch/simulator.log" 2>&1 &
 until_true 30 "$facet" save "$address" --wait-steps 200 -o "$scratch/early.ply" || { cat "$scratch/daemon.log"; fail "no map"; exit 1; }
 
 "$scratch/follow" "$address" >"$scratch/follow.log" 2>"$scratch/follow.err" &
-follower=$!
 until_true 20 grep -q '^step .* changed' "$scratch/follow.log" || fail "the example shows nothing"
-
-say() {
-    python3 - "$address" "$@" <<'P'
-import socket, sys
-s = socket.socket(socket.AF_UNIX)
-s.connect(sys.argv[1][5:])
-s.sendall((sys.argv[2] + "\n").encode())
-print(s.recv(65536).decode())
-P
-}
 
 # Everybody holds the same, when it stands still.
 same() { # WHERE
     say '?PAUSE' | grep '"OK"' >/dev/null || fail "$1: the daemon does not pause"
-    sleep 1
+    until_true 60 holds "s['queue']['idle']"
     "$scratch/hash" "$address" plain >"$scratch/plain" || fail "$1: $(cat "$scratch/plain")"
     "$scratch/hash" "$address" coded >"$scratch/coded"
     "$scratch/hash_cxx" "$address" >"$scratch/cxx"

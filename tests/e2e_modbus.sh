@@ -1,53 +1,19 @@
 #!/bin/sh
 # Claim: somebody else's Modbus says the same as ours. npm's modbus-serial is the servo that facetd sweeps, by RTU and TCP;
 # mbpoll is the master of the simulated servo, by RTU and TCP. And a drive that is not well stops the sweep, said once.
+. "$(dirname "$0")/lib.sh"
 set -u
-build=${FACET_BUILD:-build}
-tests=$(dirname "$0")
-out=$(mktemp -d)
-unset FACETD FACETD_CONFIG
-failures=0 tried=0 skipped=
-processes=
-
-fail() {
-    echo "FAILED: $*"
-    failures=$((failures + 1))
-}
-
-ends() { # PROCESS: it is asked to end, and has
-    kill "$1" 2>/dev/null
-    wait "$1" 2>/dev/null
-}
-
-cleanup() {
-    for process in $processes; do
-        kill "$process" 2>/dev/null
-    done
-    wait 2>/dev/null
-    rm -rf "$out"
-}
-trap cleanup EXIT
-trap 'exit 1' INT TERM
-
-until_true() { # SECONDS COMMAND...: tried five times a second
-    last=$(($(date +%s) + $1))
-    shift
-    until "$@" 2>/dev/null; do
-        [ "$(date +%s)" -le $last ] || return 1
-        sleep 0.2
-    done
-}
+tried=0 skipped=
 
 says() { # WORDS: how often the daemon's log has them
-    grep -c -- "$1" "$out/facetd.log"
+    grep -c -- "$1" "$scratch/facetd.log"
 }
 
-begins() { # the daemon, on $out/facetd.yaml
-    "$build/facetd" --config "$out/facetd.yaml" >"$out/facetd.log" 2>&1 &
+begins() { # the daemon, on $scratch/facetd.yaml
+    "$facetd" --config "$scratch/facetd.yaml" >"$scratch/facetd.log" 2>&1 &
     daemon=$!
-    processes="$processes $daemon"
-    until_true 30 grep -q 'servo: streaming' "$out/facetd.log" || {
-        fail "$1: facetd does not stream: $(cat "$out/facetd.log")"
+    until_true 30 grep -q 'servo: streaming' "$scratch/facetd.log" || {
+        fail "$1: facetd does not stream: $(cat "$scratch/facetd.log")"
         return 1
     }
 }
@@ -61,18 +27,18 @@ install_peer() {
     }
     peer=$build/modbus_serial
     mkdir -p "$peer"
-    cp "$tests/modbus_serial/package.json" "$tests/modbus_serial/package-lock.json" "$tests/modbus_serial/servo.js" "$peer"
+    cp tests/modbus_serial/package.json tests/modbus_serial/package-lock.json tests/modbus_serial/servo.js "$peer"
     [ -d "$peer/node_modules/modbus-serial" ] && [ ! "$peer/package-lock.json" -nt "$peer/node_modules/.package-lock.json" ] &&
         return 0
-    (cd "$peer" && timeout 120 npm ci --no-audit --no-fund >"$out/npm.log" 2>&1) || {
-        skipped="npm cannot get modbus-serial: $(tail -n 1 "$out/npm.log")"
+    (cd "$peer" && timeout 120 npm ci --no-audit --no-fund >"$scratch/npm.log" 2>&1) || {
+        skipped="npm cannot get modbus-serial: $(tail -n 1 "$scratch/npm.log")"
         return 1
     }
 }
 
 # sweep_peer KIND CONNECT: facetd commands the servo that stands there until it has turned six times
 sweep_peer() {
-    cat >"$out/facetd.yaml" <<YAML
+    cat >"$scratch/facetd.yaml" <<YAML
 devices:
   - {name: servo, driver: modbus, connect: "$2", unit: 7, parity: none, period: 20ms,
      position: {function: 3, address: 101, type: f32, order: CDAB, scale: 1deg},
@@ -81,13 +47,13 @@ devices:
      write: [{address: 111, value: 1, until: {address: 112, mask: 1, value: 1}}], stop: [{address: 111, value: 0}],
      limits: [-21deg, 31deg]}
 sweep: {device: servo, from: -20deg, to: 30deg, speed: 60deg, rest: 5deg}
-listen: {native: ["unix:$out/facetd.sock"]}
+listen: {native: ["unix:$scratch/facetd.sock"]}
 YAML
     begins "modbus-serial by $1" || return
     until_true 60 peer_has_turned 6 || fail "modbus-serial by $1 does not sweep"
     ends $daemon
     ends $servo
-    python3 - "$1" "$out/servo.log" <<'PYTHON' || fail "modbus-serial by $1: $(cat "$out/servo.log")"
+    python3 - "$1" "$scratch/servo.log" <<'PYTHON' || fail "modbus-serial by $1: $(cat "$scratch/servo.log")"
 import json, sys
 did = json.loads(open(sys.argv[2]).read().splitlines()[-1])
 assert did["turns"] >= 6 and did["refused"] == 0
@@ -96,29 +62,26 @@ assert abs(did["angle"] - 5) < 0.2 and did["enabled"] == 0, "the end"
 assert -20.1 <= did["bottom"] < -19.5 and 29.5 < did["top"] <= 30.1, "angles"
 print(f"note: modbus-serial by {sys.argv[1]}: {did['targets']} targets, {did['turns']} turns, {did['reads']} reads")
 PYTHON
-    until_true 1 grep -q 'ends' "$out/facetd.log" || fail "modbus-serial by $1: no orderly end"
+    until_true 1 grep -q 'ends' "$scratch/facetd.log" || fail "modbus-serial by $1: no orderly end"
     tried=$((tried + 1))
 }
 
 peer_has_turned() { # TIMES: it is asked while it lives
     kill -USR1 $servo
     sleep 0.2
-    [ "$(sed -n 's/.*"turns":\([0-9]*\).*/\1/p' "$out/servo.log" | tail -n 1)" -ge "$1" ]
+    [ "$(sed -n 's/.*"turns":\([0-9]*\).*/\1/p' "$scratch/servo.log" | tail -n 1)" -ge "$1" ]
 }
 
 play_peer() {
-    node "$peer/servo.js" tcp "$out/port" >"$out/servo.log" 2>&1 &
+    node "$peer/servo.js" tcp "$scratch/port" >"$scratch/servo.log" 2>&1 &
     servo=$!
-    processes="$processes $servo"
-    until_true 30 test -s "$out/port" && sweep_peer TCP "127.0.0.1:$(cat "$out/port")" ||
-        fail "modbus-serial by TCP: $(cat "$out/servo.log")"
-    python3 "$tests/pty_pair.py" "$out/line" "$out/other" &
-    processes="$processes $!"
-    until_true 10 test -e "$out/other"
-    node "$peer/servo.js" rtu "$out/other" >"$out/servo.log" 2>&1 &
+    until_true 30 test -s "$scratch/port" && sweep_peer TCP "127.0.0.1:$(cat "$scratch/port")" ||
+        fail "modbus-serial by TCP: $(cat "$scratch/servo.log")"
+    python3 tests/pty_pair.py "$scratch/line" "$scratch/other" &
+    until_true 10 test -e "$scratch/other"
+    node "$peer/servo.js" rtu "$scratch/other" >"$scratch/servo.log" 2>&1 &
     servo=$!
-    processes="$processes $servo"
-    sweep_peer RTU "$out/line"
+    sweep_peer RTU "$scratch/line"
 }
 
 # ---- mbpoll ----
@@ -155,15 +118,14 @@ play_master() { # KIND TRANSPORT...: from one end to the other and back, and wha
 }
 
 simulates() { # KIND: without a daemon
-    mkdir "$out/$1"
-    "$build/facet" simulate hall --endless --servo "$1" --dir "$out/$1" >"$out/simulate.log" 2>&1 &
+    mkdir "$scratch/$1"
+    "$facet" simulate hall --endless --servo "$1" --dir "$scratch/$1" >"$scratch/simulate.log" 2>&1 &
     simulator=$!
-    processes="$processes $simulator"
-    until_true 30 test -s "$out/$1/facetd.yaml" || fail "the simulator does not begin: $(cat "$out/simulate.log")"
+    until_true 30 test -s "$scratch/$1/facetd.yaml" || fail "the simulator does not begin: $(cat "$scratch/simulate.log")"
 }
 
 address_of() { # KIND: HOST:PORT of its servo
-    sed -n 's/.*driver: modbus, connect: "\([^"]*\)".*/\1/p' "$out/$1/facetd.yaml"
+    sed -n 's/.*driver: modbus, connect: "\([^"]*\)".*/\1/p' "$scratch/$1/facetd.yaml"
 }
 
 # ---- a drive that is not well ----
@@ -174,7 +136,7 @@ import socket, sys
 s = socket.socket(socket.AF_UNIX)
 s.connect(sys.argv[1])
 s.sendall(sys.stdin.buffer.read())
-s.recv(1000)' "$out/modbus-tcp/simulator.sock"
+s.recv(1000)' "$scratch/modbus-tcp/simulator.sock"
 }
 
 stands() { # by TCP, beside facetd
@@ -191,22 +153,22 @@ trouble_stops() { # CASE SENTENCE WORDS: ordered, it stops the sweep, which is s
     begins "$1" || return
     until_true 30 moves || fail "$1: it does not sweep"
     orders "$2"
-    until_true 30 grep -q -- "$3" "$out/facetd.log" || fail "$1: nobody says '$3': $(cat "$out/facetd.log")"
+    until_true 30 grep -q -- "$3" "$scratch/facetd.log" || fail "$1: nobody says '$3': $(cat "$scratch/facetd.log")"
     until_true 10 stands || fail "$1: it still moves"
     sleep 3
     stands || fail "$1: it moves again"
-    [ "$(says "$3")" -eq 1 ] || fail "$1: said $(says "$3") times: $(cat "$out/facetd.log")"
+    [ "$(says "$3")" -eq 1 ] || fail "$1: said $(says "$3") times: $(cat "$scratch/facetd.log")"
     ends $daemon
     tried=$((tried + 1))
 }
 
 trouble() {
     port=$(address_of modbus-tcp | sed 's/.*://')
-    sed -e '/name: laser/,/tilt: servo/d' -e '/name: pose/d' -e "s|unix:[^\"]*facetd.sock|unix:$out/facetd.sock|" \
-        "$out/modbus-tcp/facetd.yaml" >"$out/facetd.yaml"
-    sed 's/to: 45deg/to: 50.5deg/' "$out/facetd.yaml" >"$out/beyond.yaml"
-    "$build/facetd" --check-config --config "$out/beyond.yaml" >"$out/beyond.log" 2>&1 && fail "a target beyond the limits is taken"
-    grep -q "sweep.to: lies outside the limits of 'servo'" "$out/beyond.log" || fail "limits: $(cat "$out/beyond.log")"
+    sed -e '/name: laser/,/tilt: servo/d' -e '/name: pose/d' -e "s|unix:[^\"]*facetd.sock|unix:$scratch/facetd.sock|" \
+        "$scratch/modbus-tcp/facetd.yaml" >"$scratch/facetd.yaml"
+    sed 's/to: 45deg/to: 50.5deg/' "$scratch/facetd.yaml" >"$scratch/beyond.yaml"
+    "$facetd" --check-config --config "$scratch/beyond.yaml" >"$scratch/beyond.log" 2>&1 && fail "a target beyond the limits is taken"
+    grep -q "sweep.to: lies outside the limits of 'servo'" "$scratch/beyond.log" || fail "limits: $(cat "$scratch/beyond.log")"
     trouble_stops 'an axis that is stuck' 'servo: stuck for 20s' 'the sweep stopped: servo '
     until_true 60 says_stuck_no_more
     trouble_stops 'a fault that stays' 'servo: fault for 30s' 'that its reset did not clear'
@@ -232,7 +194,7 @@ if command -v mbpoll >/dev/null; then
 else
     skipped="$skipped${skipped:+; }mbpoll is not installed"
 fi
-[ $failures -eq 0 ] || exit 1
+[ $failed -eq 0 ] || exit 1
 [ -z "$skipped" ] || {
     echo "note: $tried rows played"
     echo "$skipped"

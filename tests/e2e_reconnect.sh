@@ -1,61 +1,15 @@
 #!/bin/sh
 # Law L9: devices that vanish under a running daemon cost what they would have seen and nothing else: they stream again by
 # themselves when they are back, the map goes on from where it stood, and the log has a line for each change, not for each try.
-cd "$(dirname "$0")/.." || exit 2
-build=$PWD/${FACET_BUILD:-build}
-scratch=$(mktemp -d)
-simulator='' daemon=''
-unset FACETD XDG_RUNTIME_DIR FACETD_CONFIG
-cleanup() {
-    for pid in $daemon $simulator; do kill -KILL "$pid" 2>/dev/null; done
-    wait 2>/dev/null
-    rm -rf "$scratch"
-}
-trap cleanup EXIT
-trap 'exit 1' INT TERM
-failed=0
-
-fail() {
-    echo "FAILED: $*"
-    failed=1
-}
-
-give_up() {
-    fail "$@"
-    cat "$scratch"/*.log
-    exit 1
-}
-
-until_true() { # COMMAND...: tried five times a second for a minute
-    end=$(($(date +%s) + 60))
-    while ! "$@"; do
-        [ "$(date +%s)" -lt $end ] || return 1
-        sleep 0.2
-    done
-}
+. "$(dirname "$0")/lib.sh"
+address=unix:$scratch/d/facetd.sock
 
 # shellcheck disable=SC2120
 start_devices() { # ARGUMENTS...
-    "$build/facet" simulate hall --dir "$scratch/d" "$@" >>"$scratch/simulator.log" 2>&1 &
+    "$facet" simulate hall --dir "$scratch/d" "$@" >>"$scratch/simulator.log" 2>&1 &
     simulator=$!
-    until_true [ -e "$scratch/d/servo" ] && until_true [ -e "$scratch/d/facetd.yaml" ] ||
+    until_true 60 [ -e "$scratch/d/servo" ] && until_true 60 [ -e "$scratch/d/facetd.yaml" ] ||
         give_up "the simulator does not come up"
-}
-
-status() { # EXPRESSION over the status s and its devices d: its value
-    timeout 20 "$build/facet" watch --once --json "unix:$scratch/d/facetd.sock" 2>/dev/null | python3 -c '
-import json, sys
-line = sys.stdin.readline()
-if not line: sys.exit(1)
-s = json.loads(line)
-d = {device["name"]: device for device in s["devices"]}
-value = eval(sys.argv[1])
-print(value)
-sys.exit(value is False)' "$1"
-}
-
-holds() {
-    status "$1" >/dev/null
 }
 
 step_of() {
@@ -68,17 +22,16 @@ lines() { # PATTERN: how often the daemon's log says it
 
 ALL='all(device["state"] == "streaming" for device in d.values())'
 start_devices
-"$build/facetd" --config "$scratch/d/facetd.yaml" 2>"$scratch/daemon.log" &
+"$facetd" --config "$scratch/d/facetd.yaml" 2>"$scratch/daemon.log" &
 daemon=$!
-until_true holds "$ALL and s['step'] >= 20" || give_up "the devices do not stream"
+until_true 60 holds "$ALL and s['step'] >= 20" || give_up "the devices do not stream"
 
 # Pulled out: the nodes go, as udev takes them, and nobody may meet a stranger's terminal of the same number.
 rm -f "$scratch/d/laser" "$scratch/d/servo"
 kill -KILL $simulator
 wait $simulator 2>/dev/null
-simulator=''
 # Ten tries of both, so that a line for each would be seen.
-until_true holds 'all(d[name]["state"] != "streaming" and d[name]["losses"] >= 5 for name in ("laser", "servo"))' ||
+until_true 60 holds 'all(d[name]["state"] != "streaming" and d[name]["losses"] >= 5 for name in ("laser", "servo"))' ||
     give_up "the devices are not lost"
 before=$(step_of)
 map=$(status 's["map"], s["generation"]')
@@ -89,8 +42,8 @@ kill -0 $daemon || give_up "the daemon ended with its devices"
 start_devices
 begin=$(date +%s)
 [ "$(step_of)" -ge "$before" ] || fail "the map fell back from step $before"
-until_true holds "$ALL" || give_up "the devices do not come back"
-until_true holds "$ALL and s['step'] >= $before + 20" || give_up "the map does not grow again after step $before: $(step_of)"
+until_true 60 holds "$ALL" || give_up "the devices do not come back"
+until_true 60 holds "$ALL and s['step'] >= $before + 20" || give_up "the map does not grow again after step $before: $(step_of)"
 after=$(step_of)
 [ "$(status 's["map"], s["generation"]')" = "$map" ] || fail "it is another map now"
 echo "note: $tries tries while the devices were away, $(wc -l <"$scratch/daemon.log") lines of log, step $before to $after $(($(date +%s) - begin)) s after their return"
@@ -106,6 +59,5 @@ for name in laser servo; do
 done
 kill -TERM $daemon
 wait $daemon || fail "the daemon did not end well"
-daemon=''
 [ $failed -eq 0 ] || cat "$scratch/daemon.log"
 exit $failed

@@ -1,19 +1,11 @@
 #!/bin/sh
 # Laws L2, L8: `facet reconstruct` as its users meet it: every input and output, the same bytes with any number of threads,
 # one sentence and the documented status for what is wrong, and never half a file.
+. "$(dirname "$0")/lib.sh"
 set -u
-facet=${FACET_BUILD:-build}/facet
-out=$(mktemp -d)
-trap 'chmod -R u+w "$out"; rm -rf "$out"' EXIT
-failures=0
-
-fail() {
-    echo "FAILED: $*"
-    failures=$((failures + 1))
-}
 
 # A room of 4 x 3 x 2.5 m, scanned by a servo that tilts: a raster that anybody can make.
-python3 - "$out" <<'PY'
+python3 - "$scratch" <<'PY'
 import math, struct, sys
 out = sys.argv[1]
 def cast(d):
@@ -47,48 +39,48 @@ hash_of() { sed 's/.*"hash": "\([0-9a-f]*\)".*/\1/' "$1"; }
 good() { # NAME OPTION...: must succeed and write OUT and the figures
     name=$1
     shift
-    "$facet" reconstruct --stats "$out/$name.json" -o "$out/$name.ply" "$@" >"$out/log" 2>&1 || fail "$name: $(cat "$out/log")"
-    [ -s "$out/$name.ply" ] || fail "$name: no mesh"
+    "$facet" reconstruct --stats "$scratch/$name.json" -o "$scratch/$name.ply" "$@" >"$scratch/log" 2>&1 || fail "$name: $(cat "$scratch/log")"
+    [ -s "$scratch/$name.ply" ] || fail "$name: no mesh"
 }
 
 refused() { # STATUS WORDS OPTION...: must say WORDS in one line and leave no OUT
     status=$1 words=$2
     shift 2
-    rm -f "$out/bad.ply"
-    "$facet" "$@" >"$out/log" 2>&1
+    rm -f "$scratch/bad.ply"
+    "$facet" "$@" >"$scratch/log" 2>&1
     got=$?
-    [ $got -eq "$status" ] || fail "status $got, not $status: $*: $(cat "$out/log")"
-    grep -q -e "$words" "$out/log" || fail "'$words' is not in: $(cat "$out/log")"
-    [ "$(wc -l <"$out/log")" -eq 1 ] || fail "more than a line: $(cat "$out/log")"
-    [ ! -e "$out/bad.ply" ] || fail "left a file: $*"
+    [ $got -eq "$status" ] || fail "status $got, not $status: $*: $(cat "$scratch/log")"
+    grep -q -e "$words" "$scratch/log" || fail "'$words' is not in: $(cat "$scratch/log")"
+    [ "$(wc -l <"$scratch/log")" -eq 1 ] || fail "more than a line: $(cat "$scratch/log")"
+    [ ! -e "$scratch/bad.ply" ] || fail "left a file: $*"
 }
 
 # Scans and clouds, every ending, threads.
-good scan --cell 0.05 "$out/scan000.3d"
-good two --cell 0.05 --threads 2 "$out/scan000.3d"
-cmp -s "$out/scan.ply" "$out/two.ply" || fail "two threads give another mesh"
-[ "$(hash_of "$out/scan.json")" = "$(hash_of "$out/two.json")" ] || fail "two threads give another hash"
-good raw --reduce off "$out/scan000.3d"
+good scan --cell 0.05 "$scratch/scan000.3d"
+good two --cell 0.05 --threads 2 "$scratch/scan000.3d"
+cmp -s "$scratch/scan.ply" "$scratch/two.ply" || fail "two threads give another mesh"
+[ "$(hash_of "$scratch/scan.json")" = "$(hash_of "$scratch/two.json")" ] || fail "two threads give another hash"
+good raw --reduce off "$scratch/scan000.3d"
 for kind in pts ply pcd xyz; do
-    good "cloud_$kind" "$out/cloud.$kind"
+    good "cloud_$kind" "$scratch/cloud.$kind"
 done
 for kind in pts ply pcd; do
-    cmp -s "$out/cloud_xyz.ply" "$out/cloud_$kind.ply" || fail "the same points as .$kind give another mesh than as .xyz"
+    cmp -s "$scratch/cloud_xyz.ply" "$scratch/cloud_$kind.ply" || fail "the same points as .$kind give another mesh than as .xyz"
 done
 for kind in obj stl glb; do
-    "$facet" reconstruct -o "$out/mesh.$kind" "$out/scan000.3d" >/dev/null || fail "$kind"
-    [ -s "$out/mesh.$kind" ] || fail "no $kind"
+    "$facet" reconstruct -o "$scratch/mesh.$kind" "$scratch/scan000.3d" >/dev/null || fail "$kind"
+    [ -s "$scratch/mesh.$kind" ] || fail "no $kind"
 done
-good text --ascii "$out/scan000.3d"
-head -n 2 "$out/text.ply" | grep -q ascii || fail "--ascii is not text"
-good turned --pose "$out/turned.pose" "$out/scan000.3d"
-good listed --poses "$out/list.tum" "$out/scan000.3d"
-good still --no-pose "$out/scan000.3d"
-cmp -s "$out/still.ply" "$out/scan.ply" || fail "a pose of zeros is not the origin"
-! cmp -s "$out/listed.ply" "$out/scan.ply" || fail "--poses moved nothing"
+good text --ascii "$scratch/scan000.3d"
+head -n 2 "$scratch/text.ply" | grep -q ascii || fail "--ascii is not text"
+good turned --pose "$scratch/turned.pose" "$scratch/scan000.3d"
+good listed --poses "$scratch/list.tum" "$scratch/scan000.3d"
+good still --no-pose "$scratch/scan000.3d"
+cmp -s "$scratch/still.ply" "$scratch/scan.ply" || fail "a pose of zeros is not the origin"
+! cmp -s "$scratch/listed.ply" "$scratch/scan.ply" || fail "--poses moved nothing"
 
 # The figures.
-python3 - "$out" <<'PY' || fail "figures"
+python3 - "$scratch" <<'PY' || fail "figures"
 import json, os, sys
 s, raw = (json.load(open(sys.argv[1] + f)) for f in ("/scan.json", "/raw.json"))
 keys = "points rows sweeps blocks patches cells faces_raw faces planes reduction batches seconds peak_rss_bytes hash".split()
@@ -102,7 +94,7 @@ assert s["peak_rss_bytes"] > 1 << 20 and len(s["hash"]) == 64
 PY
 
 # What is wrong is said, by name.
-cd "$out" || exit 1
+cd "$scratch" || exit 1
 case $facet in /*) ;; *) facet=$OLDPWD/$facet ;; esac
 bad="reconstruct -o bad.ply"
 printf '1 2 3\n4 five 6\n' >wrong.3d
@@ -165,5 +157,5 @@ echo old >kept.ply
 "$facet" reconstruct -o kept.ply --no-pose wrong.3d 2>/dev/null
 [ "$(cat kept.ply)" = old ] || fail "an older file was touched"
 ls -A | grep -q '\.part$' && fail "parts of files are left"
-[ $failures -eq 0 ] && echo "note: clouds as .xyz .pts .ply .pcd and a raster, 1 and 2 threads: the same bytes"
-[ $failures -eq 0 ]
+[ $failed -eq 0 ] && echo "note: clouds as .xyz .pts .ply .pcd and a raster, 1 and 2 threads: the same bytes"
+exit $failed

@@ -1,61 +1,43 @@
 #!/bin/sh
 # Claim: recordings are MCAP for others too: @mcap/core's readers, CRCs checked, find in files of a rotation, in one taken by
 # `facet record` and in a repaired one what `facet info` says. And: files of a rotation, in a row, give the map of the journal.
+. "$(dirname "$0")/lib.sh"
 set -u
-build=${FACET_BUILD:-build}
-tests=$(dirname "$0")
-unset FACETD FACETD_CONFIG
-out=$(mktemp -d)
-simulator= daemon=
-trap 'kill $daemon $simulator 2>/dev/null; wait 2>/dev/null; rm -rf "$out"' EXIT
-trap 'exit 1' INT TERM
-failed=0
-
-fail() {
-    echo "FAILED: $*"
-    failed=1
-}
-
-until_true() { # SECONDS COMMAND...
-    last=$(($(date +%s) + $1))
-    shift
-    until "$@" 2>/dev/null; do
-        [ "$(date +%s)" -le $last ] || return 1
-        sleep 0.1
-    done
-}
 
 files() { # how many recordings there are at least
-    [ "$(ls "$out/rec" 2>/dev/null | wc -l)" -ge "$1" ]
+    [ "$(ls "$scratch/rec" 2>/dev/null | wc -l)" -ge "$1" ]
 }
 
-mkdir "$out/sim"
-"$build/facet" simulate building --endless --dir "$out/sim" >"$out/simulate.log" 2>&1 &
-simulator=$!
-until_true 30 test -s "$out/sim/facetd.yaml" || { cat "$out/simulate.log"; exit 1; }
-{ cat "$out/sim/facetd.yaml"; echo "record: {dir: $out/rec, max_age: 2s, messages: on}"; } >"$out/facetd.yaml"
-"$build/facetd" --config "$out/facetd.yaml" --journal "$out/journal" >"$out/log" 2>&1 &
+mkdir "$scratch/sim"
+"$facet" simulate building --endless --dir "$scratch/sim" >"$scratch/simulate.log" 2>&1 &
+until_true 30 test -s "$scratch/sim/facetd.yaml" || { cat "$scratch/simulate.log"; exit 1; }
+{ cat "$scratch/sim/facetd.yaml"; echo "record: {dir: $scratch/rec, max_age: 2s, messages: on}"; } >"$scratch/facetd.yaml"
+"$facetd" --config "$scratch/facetd.yaml" --journal "$scratch/journal" >"$scratch/log" 2>&1 &
 daemon=$!
-until_true 30 files 2 || fail "no second file: $(cat "$out/log")"
-timeout 60 "$build/facet" record "unix:$out/sim/facetd.sock" -o "$out/taken.mcap" -d 2 >"$out/said" 2>&1 || fail "facet record: $(cat "$out/said")"
-until_true 30 files 3 || fail "no third file: $(cat "$out/log")"
+until_true 30 files 2 || fail "no second file: $(cat "$scratch/log")"
+timeout 60 "$facet" record "unix:$scratch/sim/facetd.sock" -o "$scratch/taken.mcap" -d 2 >"$scratch/said" 2>&1 || fail "facet record: $(cat "$scratch/said")"
+until_true 30 files 3 || fail "no third file: $(cat "$scratch/log")"
 kill $daemon
 wait $daemon || fail "not an orderly end"
-daemon=
-first=$(ls "$out"/rec/*.mcap | head -n 1)
-head -c "$(($(wc -c <"$first") * 2 / 3))" "$first" >"$out/cut.mcap"
-"$build/facet" repair "$out/cut.mcap" -o "$out/repaired.mcap" >/dev/null || fail "facet repair"
+first=$(ls "$scratch"/rec/*.mcap | head -n 1)
+head -c "$(($(wc -c <"$first") * 2 / 3))" "$first" >"$scratch/cut.mcap"
+"$facet" repair "$scratch/cut.mcap" -o "$scratch/repaired.mcap" >/dev/null || fail "facet repair"
 
 # Files of one rotation, one after the other, are the journal.
-"$build/facet" replay "$out"/rec/*.mcap -o "$out/a.ply" --stats "$out/a.json" >/dev/null || fail "the files do not replay"
-"$build/facet" replay "$out/journal" --config "$out/facetd.yaml" -o "$out/b.ply" --stats "$out/b.json" >/dev/null || fail "the journal does not replay"
-cmp -s "$out/a.ply" "$out/b.ply" || fail "the recording gives another map than the journal"
+"$facet" replay "$scratch"/rec/*.mcap -o "$scratch/a.ply" --stats "$scratch/a.json" >/dev/null || fail "the files do not replay"
+"$facet" replay "$scratch/journal" --config "$scratch/facetd.yaml" -o "$scratch/b.ply" --stats "$scratch/b.json" >/dev/null || fail "the journal does not replay"
+cmp -s "$scratch/a.ply" "$scratch/b.ply" || fail "the recording gives another map than the journal"
+number=1
+for file in "$scratch"/rec/*.mcap; do
+    [ $number -eq 1 ] || replays_midway "file $number of the rotation alone" "$file" "$scratch/journal" "$scratch/facetd.yaml"
+    number=$((number + 1))
+done
 
-packages=$("$tests/npm/install" "$build") || { [ $failed -eq 0 ] || exit 1; echo "$packages"; exit 77; }
-for file in "$out"/rec/*.mcap "$out/taken.mcap" "$out/repaired.mcap"; do
-    "$build/facet" info --json "$file" >"$out/ours.json" || fail "facet info $file"
-    node "$tests/mcap_read.mjs" "$packages" "$file" >"$out/theirs.json" 2>"$out/node.log" || fail "@mcap/core on $file: $(tail -n 5 "$out/node.log")"
-    python3 - "$out/ours.json" "$out/theirs.json" "$(basename "$file")" <<'PYTHON' || failed=1
+packages=$(tests/npm/install "$build") || { [ $failed -eq 0 ] || exit 1; echo "$packages"; exit 77; }
+for file in "$scratch"/rec/*.mcap "$scratch/taken.mcap" "$scratch/repaired.mcap"; do
+    "$facet" info --json "$file" >"$scratch/ours.json" || fail "facet info $file"
+    node tests/mcap_read.mjs "$packages" "$file" >"$scratch/theirs.json" 2>"$scratch/node.log" || fail "@mcap/core on $file: $(tail -n 5 "$scratch/node.log")"
+    python3 - "$scratch/ours.json" "$scratch/theirs.json" "$(basename "$file")" <<'PYTHON' || failed=1
 import json, sys
 ours, theirs, name = json.load(open(sys.argv[1])), json.load(open(sys.argv[2])), sys.argv[3]
 counts = {c["topic"]: c["messages"] for c in ours["channels"] if c["messages"]}

@@ -2,61 +2,11 @@
 # Laws L7, L2: a drive, live and replayed in every way there is, is one map: kept journal and recording, all files of a rotation in
 # any order, any batches, threads and speeds, another compiler without optimisation, through facet and through facetd, after
 # seeking there and back, and taken apart into what people have (a capture, a candump log, a list of poses).
-cd "$(dirname "$0")/.." || exit 2
-build=$PWD/${FACET_BUILD:-build}
-facet=$build/facet
-scratch=$(mktemp -d)
-daemon=
-unset FACETD XDG_RUNTIME_DIR FACETD_CONFIG
-cleanup() {
-    [ -n "$daemon" ] && kill "$daemon" 2>/dev/null
-    wait 2>/dev/null
-    rm -rf "$scratch"
-}
-trap cleanup EXIT
-trap 'exit 1' INT TERM
-failed=0
+. "$(dirname "$0")/lib.sh"
 address=unix:$scratch/sim/facetd.sock
 
-fail() {
-    echo "FAILED: $*"
-    failed=1
-}
-
-say() { # COMMAND: on the daemon's socket
-    python3 - "$scratch/sim/facetd.sock" "$1" <<'PYTHON'
-import socket, sys
-s = socket.socket(socket.AF_UNIX)
-s.settimeout(20)
-s.connect(sys.argv[1])
-s.sendall(sys.argv[2].encode() + b"\n")
-text = ""
-while '"OK"' not in text and '"ERROR"' not in text:
-    text += s.recv(65536).decode()
-print(text.splitlines()[-1])
-PYTHON
-}
-
-status() { # PYTHON EXPRESSION of j
-    "$facet" watch --once --json "$address" 2>/dev/null | python3 -c "import json, sys
-for line in sys.stdin:
-    j = json.loads(line)
-    if j.get('class') == 'STATUS': print($1)" 2>/dev/null
-}
-
-until_status() { # WANTED EXPRESSION: within two minutes
-    for _ in $(seq 300); do
-        [ "$(status "$2")" = "$1" ] && return 0
-        sleep 0.2
-    done
-    fail "never was $2 $1"
-    cat "$scratch"/*.log
-    exit 1
-}
-
-hash_of() { # ARGUMENT...: of facet replay
-    "$facet" replay -o "$scratch/out.ply" "$@" >"$scratch/told" 2>"$scratch/err" || { cat "$scratch/err"; echo none; }
-    sed -n 's/^hash //p' "$scratch/told"
+until_holds() { # EXPRESSION
+    until_true 120 holds "$1" || give_up "never was: $1"
 }
 
 same() { # TITLE ARGUMENT...
@@ -70,26 +20,23 @@ same() { # TITLE ARGUMENT...
 cat >"$scratch/live" <<LIVE
 sed '/^record:/d' "$scratch/sim/facetd.yaml" >"$scratch/live.yaml"
 echo "record: {dir: $scratch/recorded, max_age: 3s}" >>"$scratch/live.yaml"
-exec "$build/facetd" --config "$scratch/live.yaml" --journal "$scratch/journal"
+exec "$facetd" --config "$scratch/live.yaml" --journal "$scratch/journal"
 LIVE
 mkdir "$scratch/recorded"
 "$facet" simulate building --endless --laser tim --servo can --dir "$scratch/sim" -- sh "$scratch/live" >"$scratch/live.log" 2>&1 &
 daemon=$!
-until_status True "j['step'] > 15"
+until_holds "s['step'] > 15"
 say '?RESET' >/dev/null
-until_status True "j['generation'] > 1 and j['step'] > 15"
+until_holds "s['generation'] > 1 and s['step'] > 15"
 say '?PAUSE' >/dev/null
 sleep 1
 say '?RESUME' >/dev/null
-until_status True "j['generation'] > 1 and j['step'] > 60"
+until_holds "s['generation'] > 1 and s['step'] > 60"
 say '?PAUSE' >/dev/null
-sleep 1
-until_status 0 "j['queue']['length']"
-sleep 1
+until_holds "s['queue']['idle']"
 "$facet" save "$address" -o "$scratch/live.ply" >/dev/null || fail "the live map was not saved"
 kill "$daemon"
 wait "$daemon" 2>/dev/null
-daemon=
 [ "$failed" -eq 0 ] || { cat "$scratch/live.log"; exit 1; }
 
 wanted=$(hash_of --config "$scratch/live.yaml" "$scratch/journal.2")
@@ -137,25 +84,24 @@ replayed() { # TITLE
 }
 mkdir -p "$scratch/sim"
 for speed in max 30; do
-    "$build/facetd" --config "$scratch/live.yaml" --speed $speed --replay "$@" >"$scratch/replay.log" 2>&1 &
+    "$facetd" --config "$scratch/live.yaml" --speed $speed --replay "$@" >"$scratch/replay.log" 2>&1 &
     daemon=$!
-    until_status ended "j['replay']['state']"
+    until_holds "s['replay']['state'] == 'ended'"
     replayed "facetd --replay --speed $speed"
     if [ $speed = max ]; then
-        middle=$(status "(j['replay']['begin'] + j['replay']['end']) / 2")
-        generation=$(status "j['generation']")
+        middle=$(status "(s['replay']['begin'] + s['replay']['end']) / 2")
+        generation=$(status "s['generation']")
         say '?PAUSE' >/dev/null
         say "?SEEK={\"t\": $middle}" >/dev/null
-        until_status paused "j['replay']['state']"
-        [ "$(status "j['generation'] > $generation")" = True ] || fail "seeking back is no new generation"
+        until_holds "s['replay']['state'] == 'paused'"
+        [ "$(status "s['generation'] > $generation")" = True ] || fail "seeking back is no new generation"
         say "?SEEK={\"t\": 1}" | grep -q ERROR || fail "a seek out of the recording was not refused"
         say '?RESUME' >/dev/null
-        until_status ended "j['replay']['state']"
+        until_holds "s['replay']['state'] == 'ended'"
         replayed "there and back"
     fi
     kill "$daemon"
     wait "$daemon" || fail "the daemon ended badly: $(tail -3 "$scratch/replay.log")"
-    daemon=
 done
 
 # In parts: the list before the reset, and what can be made of it. When the loop read a frame, a candump log does not tell: the

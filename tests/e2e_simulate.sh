@@ -1,31 +1,21 @@
 #!/bin/sh
 # Laws L8, L9: `facet simulate` as its users meet it: devices for anybody, one sentence for what is wrong, and when it
 # ends nothing of what it started is left, whoever ended it.
+. "$(dirname "$0")/lib.sh"
 set -u
-build=${FACET_BUILD:-build}
-facet=$build/facet
-out=$(mktemp -d)
-trap 'rm -rf "$out"' EXIT
-failures=0
-unset FACETD FACETD_CONFIG
-
-fail() {
-    echo "FAILED: $*"
-    failures=$((failures + 1))
-}
 
 # refused STATUS WORDS ARGUMENTS...: ends with STATUS and says WORDS on stderr, whose first line names the program
 refused() {
     status=$1 words=$2
     shift 2
-    timeout 30 "$facet" simulate "$@" >"$out/stdout" 2>"$out/stderr"
+    timeout 30 "$facet" simulate "$@" >"$scratch/stdout" 2>"$scratch/stderr"
     [ $? -eq "$status" ] || fail "simulate $*: status is not $status"
-    grep -q -- "$words" "$out/stderr" || fail "simulate $*: does not say '$words' but: $(head -n 2 "$out/stderr")"
-    head -n 1 "$out/stderr" | grep -q '^facet' || fail "simulate $*: the sentence does not name the program"
+    grep -q -- "$words" "$scratch/stderr" || fail "simulate $*: does not say '$words' but: $(head -n 2 "$scratch/stderr")"
+    head -n 1 "$scratch/stderr" | grep -q '^facet' || fail "simulate $*: the sentence does not name the program"
 }
 
 gone() { # no process has this text in its command line
-    for i in 1 2 3 4 5 6 7 8 9 10; do
+    for _ in 1 2 3 4 5 6 7 8 9 10; do
         pgrep -f "$1" >/dev/null || return 0
         sleep 0.2
     done
@@ -67,48 +57,48 @@ refused 2 'which COMMAND' hall --
 refused 1 'there are building and hall' castle
 refused 1 'No such file' uos:/nowhere
 refused 1 'No such file' profiles:/nowhere.csv
-refused 1 'too long' hall --dir "$out/$(printf '%0110d' 0)"
+refused 1 'too long' hall --dir "$scratch/$(printf '%0110d' 0)"
 refused 1 'give a --dir' hall --dir /proc/nowhere
-echo '0,1000,1001' >"$out/lonely.csv"
-refused 1 'pose beside it' "profiles:$out/lonely.csv"
-printf '0,1000,1001\n1,1000,x\n' >"$out/bad.csv"
-refused 1 'bad.csv: line 2' "profiles:$out/bad.csv"
+echo '0,1000,1001' >"$scratch/lonely.csv"
+refused 1 'pose beside it' "profiles:$scratch/lonely.csv"
+printf '0,1000,1001\n1,1000,x\n' >"$scratch/bad.csv"
+refused 1 'bad.csv: line 2' "profiles:$scratch/bad.csv"
 
 # COMMAND: its environment, its status, its devices, a fresh directory that goes with it
-timeout 30 "$facet" simulate hall -- sh -c 'echo "$FACETD|$FACETD_CONFIG"; ls -l "$(dirname "$FACETD_CONFIG")"; exit 7' >"$out/env"
+timeout 30 "$facet" simulate hall -- sh -c 'echo "$FACETD|$FACETD_CONFIG"; ls -l "$(dirname "$FACETD_CONFIG")"; exit 7' >"$scratch/env"
 [ $? -eq 7 ] || fail "COMMAND's status is not handed on"
-config=$(sed -n 's/^unix:.*|//p' "$out/env")
-grep -q "^address unix:${config%/*}/facetd.sock" "$out/env" || fail "the address is not said"
-grep -q 'laser -> /dev/pts' "$out/env" && grep -q 'servo -> /dev/pts' "$out/env" || fail "the devices are not in the directory"
+config=$(sed -n 's/^unix:.*|//p' "$scratch/env")
+grep -q "^address unix:${config%/*}/facetd.sock" "$scratch/env" || fail "the address is not said"
+grep -q 'laser -> /dev/pts' "$scratch/env" && grep -q 'servo -> /dev/pts' "$scratch/env" || fail "the devices are not in the directory"
 [ -n "$config" ] && [ ! -e "${config%/*}" ] || fail "a fresh directory was left"
-timeout 30 "$facet" simulate hall -- /nowhere/program 2>"$out/stderr"
+timeout 30 "$facet" simulate hall -- /nowhere/program 2>"$scratch/stderr"
 [ $? -eq 127 ] || fail "a COMMAND that is not there: status is not 127"
-grep -q '/nowhere/program: No such file' "$out/stderr" || fail "a COMMAND that is not there is not named"
+grep -q '/nowhere/program: No such file' "$scratch/stderr" || fail "a COMMAND that is not there is not named"
 
 # A directory that was given stays, its links go; the configuration is one that the daemon takes
-timeout 30 "$facet" simulate building --dir "$out/given" --servo tcp --tcp 127.0.0.1:7999 -- \
-    sh -c "$build/facetd --check-config"' --config "$FACETD_CONFIG"' >"$out/check" 2>&1 || fail "facetd refuses the configuration: $(cat "$out/check")"
-[ -e "$out/given/facetd.yaml" ] && [ ! -e "$out/given/laser" ] && [ ! -e "$out/given/servo" ] || fail "given directory: $(ls "$out/given")"
-grep -q 'tcp:127.0.0.1:7999' "$out/given/facetd.yaml" || fail "--tcp is not in the configuration"
+timeout 30 "$facet" simulate building --dir "$scratch/given" --servo tcp --tcp 127.0.0.1:7999 -- \
+    sh -c "$build/facetd --check-config"' --config "$FACETD_CONFIG"' >"$scratch/check" 2>&1 || fail "facetd refuses the configuration: $(cat "$scratch/check")"
+[ -e "$scratch/given/facetd.yaml" ] && [ ! -e "$scratch/given/laser" ] && [ ! -e "$scratch/given/servo" ] || fail "given directory: $(ls "$scratch/given")"
+grep -q 'tcp:127.0.0.1:7999' "$scratch/given/facetd.yaml" || fail "--tcp is not in the configuration"
 
 # Nothing outlives it: what COMMAND left behind, what ignores SIGTERM, and when it is itself ended
 timeout 40 "$facet" simulate hall -- sh -c 'sleep 7771 & sleep 0.3'
 gone 'sleep 7771' || fail "an orphan of COMMAND outlived it"
-timeout 60 "$facet" simulate hall --dir "$out/stopped" -- sh -c 'trap "" TERM; while :; do sleep 0.1; done # deaf-7772' &
+timeout 60 "$facet" simulate hall --dir "$scratch/stopped" -- sh -c 'trap "" TERM; while :; do sleep 0.1; done # deaf-7772' &
 simulate=$!
-for i in $(seq 100); do [ -e "$out/stopped/facetd.yaml" ] && pgrep -f deaf-7772 >/dev/null && break; sleep 0.1; done
-kill -TERM "$(pgrep -f "simulate hall --dir $out/stopped" | tail -n 1)"
+for _ in $(seq 100); do [ -e "$scratch/stopped/facetd.yaml" ] && pgrep -f deaf-7772 >/dev/null && break; sleep 0.1; done
+kill -TERM "$(pgrep -f "simulate hall --dir $scratch/stopped" | tail -n 1)"
 wait $simulate
 [ $? -eq 143 ] || fail "ended by SIGTERM: status is not 143"
 gone deaf-7772 || fail "a COMMAND that ignores SIGTERM outlived it"
-[ ! -e "$out/stopped/servo" ] || fail "a link was left after SIGTERM"
+[ ! -e "$scratch/stopped/servo" ] || fail "a link was left after SIGTERM"
 
 # The real thing, short: the hall through facetd into a mesh, with every scanner
-cat >"$out/map.sh" <<'MAP'
-"$build/facetd" 2>"$out/$laser.log" & daemon=$!
+cat >"$scratch/map.sh" <<'MAP'
+"$facetd" 2>"$scratch/$laser.log" & daemon=$!
 for i in $(seq 60); do
     sleep 1
-    "$facet" save -o "$out/$laser.ply" >"$out/$laser.save" 2>&1 && [ "$(sed -n 's/.*step \([0-9]*\),.*/\1/p' "$out/$laser.save")" -gt "$steps" ] && break
+    "$facet" save -o "$scratch/$laser.ply" >"$scratch/$laser.save" 2>&1 && [ "$(sed -n 's/.*step \([0-9]*\),.*/\1/p' "$scratch/$laser.save")" -gt "$steps" ] && break
 done
 kill -TERM $daemon
 wait $daemon
@@ -119,11 +109,11 @@ export build facet out laser steps
 map() {
     laser=$1 steps=$2 faces=$3
     shift 3
-    timeout 120 "$facet" simulate hall --endless "$@" -- sh "$out/map.sh" >"$out/$laser.said" || fail "$laser: facetd did not end well: $(tail -n 3 "$out/$laser.log")"
-    made=$(sed -n 's/.*, \([0-9]*\) faces.*/\1/p' "$out/$laser.save")
-    [ "${made:-0}" -gt "$faces" ] || fail "$laser: the hall has no mesh: $(cat "$out/$laser.save" "$out/$laser.log")"
-    grep -q '^laser: profiles [1-9]' "$out/$laser.said" || fail "$laser: what the scanner did is not said"
-    echo "note: the hall, $laser, after a few seconds: $(sed 's/^[^:]*: //' "$out/$laser.save")"
+    timeout 120 "$facet" simulate hall --endless "$@" -- sh "$scratch/map.sh" >"$scratch/$laser.said" || fail "$laser: facetd did not end well: $(tail -n 3 "$scratch/$laser.log")"
+    made=$(sed -n 's/.*, \([0-9]*\) faces.*/\1/p' "$scratch/$laser.save")
+    [ "${made:-0}" -gt "$faces" ] || fail "$laser: the hall has no mesh: $(cat "$scratch/$laser.save" "$scratch/$laser.log")"
+    grep -q '^laser: profiles [1-9]' "$scratch/$laser.said" || fail "$laser: what the scanner did is not said"
+    echo "note: the hall, $laser, after a few seconds: $(sed 's/^[^:]*: //' "$scratch/$laser.save")"
 }
 map lms2xx 150 2000 --servo canopen-cyclic --odometry
 map tim 60 2000 --laser tim
@@ -132,41 +122,41 @@ map lms5xx 80 2000 --laser lms5xx --servo modbus-tcp --encoder
 
 # Every other servo, all at once: its angle places rows, and nothing of it is lost or refused
 try_servo() {
-    map "$1" 40 300 --servo "$1" --truth "$out/$1.truth"
-    ! grep 'servo: lost\|servo: not ready' "$out/$1.log" || fail "$1: was lost"
-    grep -q "; servo $1: angle [-0-9.]* deg, speed" "$out/$1.said" || fail "$1: what the servo did is not said"
-    [ "$(awk 'NF == 6' "$out/$1.truth" | wc -l)" -gt 500 ] || fail "$1: the truth is not written"
-    exit "$failures"
+    map "$1" 40 300 --servo "$1" --truth "$scratch/$1.truth"
+    ! grep 'servo: lost\|servo: not ready' "$scratch/$1.log" || fail "$1: was lost"
+    grep -q "; servo $1: angle [-0-9.]* deg, speed" "$scratch/$1.said" || fail "$1: what the servo did is not said"
+    [ "$(awk 'NF == 6' "$scratch/$1.truth" | wc -l)" -gt 500 ] || fail "$1: the truth is not written"
+    exit "$failed"
 }
 pids=
 for servo in canopen canopen-velocity encoder inclinometer fixed; do
-    (failures=0; try_servo "$servo") &
+    (failed=0; try_servo "$servo") &
     pids="$pids $!"
 done
 for pid in $pids; do
-    wait "$pid" || failures=$((failures + 1))
+    wait "$pid" || failed=1
 done
 
 # A bus that goes, as the daemon sees it and says it: once each
-cat >"$out/bus.sh" <<'BUS'
-"$build/facetd" 2>"$out/bus.log" & daemon=$!
+cat >"$scratch/bus.sh" <<'BUS'
+"$facetd" 2>"$scratch/bus.log" & daemon=$!
 for i in $(seq 300); do
-    [ "$(grep -ac 'facetd: servo: streaming' "$out/bus.log")" -ge 3 ] && break
+    [ "$(grep -ac 'facetd: servo: streaming' "$scratch/bus.log")" -ge 3 ] && break
     sleep 0.1
 done
 kill -TERM $daemon
 wait $daemon
 BUS
-timeout 60 "$facet" simulate hall --endless --servo can --fault 'can: bus-off at 2s for 1s' --fault 'can: down at 5s for 1s' -- sh "$out/bus.sh" >"$out/bus.said"
-[ "$(grep -ac 'facetd: servo: streaming' "$out/bus.log")" -ge 3 ] || fail "the servo does not come back with its bus: $(cat "$out/bus.log")"
-[ "$(grep -ac 'facetd: servo: lost' "$out/bus.log")" -eq 2 ] || fail "the loss of the bus is not said once each: $(cat "$out/bus.log")"
-grep -q 'can: frames [1-9].*dropped [1-9].*errors 2' "$out/bus.said" || fail "what the bus did is not said: $(cat "$out/bus.said")"
+timeout 60 "$facet" simulate hall --endless --servo can --fault 'can: bus-off at 2s for 1s' --fault 'can: down at 5s for 1s' -- sh "$scratch/bus.sh" >"$scratch/bus.said"
+[ "$(grep -ac 'facetd: servo: streaming' "$scratch/bus.log")" -ge 3 ] || fail "the servo does not come back with its bus: $(cat "$scratch/bus.log")"
+[ "$(grep -ac 'facetd: servo: lost' "$scratch/bus.log")" -eq 2 ] || fail "the loss of the bus is not said once each: $(cat "$scratch/bus.log")"
+grep -q 'can: frames [1-9].*dropped [1-9].*errors 2' "$scratch/bus.said" || fail "what the bus did is not said: $(cat "$scratch/bus.said")"
 
 # Faults: ordered by the command line and at the socket, seen by the daemon, and recovered from
-cat >"$out/faults.sh" <<'FAULTS'
-"$build/facetd" 2>"$out/faults.log" & daemon=$!
+cat >"$scratch/faults.sh" <<'FAULTS'
+"$facetd" 2>"$scratch/faults.log" & daemon=$!
 laser() { # the laser's lines of the log
-    grep -a 'facetd: laser: ' "$out/faults.log"
+    grep -a 'facetd: laser: ' "$scratch/faults.log"
 }
 loses() { # it was away, whether it had streamed by then or not
     for i in $(seq 300); do
@@ -200,16 +190,16 @@ kill -TERM $daemon
 wait $daemon
 FAULTS
 for laser in lms2xx tim; do
-    timeout 120 "$facet" simulate hall --endless --laser $laser --fault 'laser: unplug at 2s for 2s' --fault 'laser: garbage at 1s for 200ms' -- sh "$out/faults.sh" >"$out/faults.said"
-    ! grep 'did not' "$out/faults.said" || fail "$laser does not come back: $(cat "$out/faults.log")"
-    grep -q 'laser: lost' "$out/faults.log" || fail "$laser: facetd does not say that it lost the scanner"
-    grep -q "^error: 'smoke': laser has no such fault; it has" "$out/faults.said" || fail "a wrong order is not refused"
-    grep -q '^{"ok":true}$' "$out/faults.said" || fail "an order in JSON is not taken"
-    grep -q '^laser: profiles [1-9]' "$out/faults.said" || fail "the status is not said"
-    grep -q '^{"ok":true,"status":"laser: profiles' "$out/faults.said" || fail "the status is not said in JSON"
-    grep -q 'garbage [1-9][0-9]* bytes' "$out/faults.said" || fail "$laser: no garbage was sent: $(tail -n 1 "$out/faults.said")"
-    echo "note: faults, $laser: $(tail -n 1 "$out/faults.said")"
+    timeout 120 "$facet" simulate hall --endless --laser $laser --fault 'laser: unplug at 2s for 2s' --fault 'laser: garbage at 1s for 200ms' -- sh "$scratch/faults.sh" >"$scratch/faults.said"
+    ! grep 'did not' "$scratch/faults.said" || fail "$laser does not come back: $(cat "$scratch/faults.log")"
+    grep -q 'laser: lost' "$scratch/faults.log" || fail "$laser: facetd does not say that it lost the scanner"
+    grep -q "^error: 'smoke': laser has no such fault; it has" "$scratch/faults.said" || fail "a wrong order is not refused"
+    grep -q '^{"ok":true}$' "$scratch/faults.said" || fail "an order in JSON is not taken"
+    grep -q '^laser: profiles [1-9]' "$scratch/faults.said" || fail "the status is not said"
+    grep -q '^{"ok":true,"status":"laser: profiles' "$scratch/faults.said" || fail "the status is not said in JSON"
+    grep -q 'garbage [1-9][0-9]* bytes' "$scratch/faults.said" || fail "$laser: no garbage was sent: $(tail -n 1 "$scratch/faults.said")"
+    echo "note: faults, $laser: $(tail -n 1 "$scratch/faults.said")"
 done
 
-[ "$failures" -eq 0 ] && echo "all well"
-exit $((failures > 0))
+[ "$failed" -eq 0 ] && echo "all well"
+exit $failed

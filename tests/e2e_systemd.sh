@@ -2,19 +2,11 @@
 # Law: the service is as locked up as it can be and still reaches its devices: units and udev rules are valid, its exposure is
 # below 2.0 (as a dynamic user, too), what `make install` puts there is what they need, and systemd knows every word of the
 # file of users.
-cd "$(dirname "$0")/.." || exit 2
+. "$(dirname "$0")/lib.sh"
 if ! command -v systemd-analyze >/dev/null 2>&1; then
     echo "systemd-analyze is not here: install the package systemd (make deps)"
     exit 77
 fi
-scratch=$(mktemp -d)
-trap 'rm -rf "$scratch"' EXIT
-failed=0
-
-fail() {
-    echo "FAILED: $*"
-    failed=1
-}
 
 # A unit is only valid if what it starts is there: an installation with a stand-in for the program.
 prefix=$scratch/prefix

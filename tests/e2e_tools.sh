@@ -1,34 +1,6 @@
 #!/bin/sh
 # Law: facet save and facet watch are honest clients: what they write is whole, what goes wrong is one sentence and a status.
-cd "$(dirname "$0")/.." || exit 2
-build=$PWD/${FACET_BUILD:-build}
-facet=$build/facet
-scratch=$(mktemp -d)
-daemon=
-unset FACETD XDG_RUNTIME_DIR FACETD_CONFIG
-cleanup() {
-    [ -n "$daemon" ] && kill "$daemon" 2>/dev/null
-    wait 2>/dev/null
-    rm -rf "$scratch"
-}
-trap cleanup EXIT
-trap 'exit 1' INT TERM
-failed=0
-
-fail() {
-    echo "FAILED: $*"
-    failed=1
-}
-
-until_true() { # SECONDS COMMAND...: tried five times a second
-    tries=$(($1 * 5))
-    shift
-    while ! "$@" >/dev/null 2>&1; do
-        tries=$((tries - 1))
-        [ $tries -gt 0 ] || return 1
-        sleep 0.2
-    done
-}
+. "$(dirname "$0")/lib.sh"
 
 refused() { # STATUS WORDS COMMAND...: ends with the status and one line on stderr that has the words
     want=$1 words=$2
@@ -56,7 +28,7 @@ for command in save watch picture; do
     "$facet" $command --help | grep -q '^Usage: facet' || fail "facet $command --help says nothing"
 done
 
-"$facet" simulate hall --dir "$scratch/run" -- "$build/facetd" >"$scratch/daemon.log" 2>&1 &
+"$facet" simulate hall --dir "$scratch/run" -- "$facetd" >"$scratch/daemon.log" 2>&1 &
 daemon=$!
 until_true 30 "$facet" watch --once "$address" || { cat "$scratch/daemon.log"; fail "the daemon does not come up"; exit 1; }
 
@@ -122,7 +94,7 @@ devices:
   - {name: unfed, driver: pose, listen: "unix:$scratch/unfed.sock"}
 listen: {native: ["unix:$scratch/lone.sock"]}
 YAML
-"$build/facetd" --config "$scratch/lone.yaml" 2>/dev/null &
+"$facetd" --config "$scratch/lone.yaml" 2>/dev/null &
 lone=$!
 is_silent() {
     "$facet" watch --once "unix:$scratch/lone.sock" | grep -q '^unfed .* silent .* 0.0 '
@@ -214,7 +186,7 @@ until_true 20 grep -q 'facet: .*; trying again every second' "$scratch/err" || f
 rm -rf "$scratch/run"
 mkdir "$scratch/run"
 : >"$scratch/lines"
-"$facet" simulate hall --dir "$scratch/run" -- "$build/facetd" >"$scratch/daemon.log" 2>&1 &
+"$facet" simulate hall --dir "$scratch/run" -- "$facetd" >"$scratch/daemon.log" 2>&1 &
 daemon=$!
 until_true 40 grep -q 'step' "$scratch/lines" || fail "the daemon that came back is not watched: $(cat "$scratch/err")"
 kill -INT "$watch"

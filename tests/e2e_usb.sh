@@ -1,18 +1,9 @@
 #!/bin/sh
 # Law: a scanner on USB streams from the daemon's start, comes back by itself when it was pulled out, and no byte of what
 # it sent while it was there is lost. The daemon, real libusb, a simulated usbfs and a simulated TiM561 (tests/usb_bed.c).
-cd "$(dirname "$0")/.." || exit 2
-build=${FACET_BUILD:-build}
+. "$(dirname "$0")/lib.sh"
 bed=$build/tests/usb_bed
-scratch=$(mktemp -d)
-pids=
-trap 'kill $pids 2>/dev/null; rm -rf "$scratch"' EXIT
-failed=0
 
-fail() {
-    echo "FAILED: $*"
-    failed=1
-}
 wait_for() { # SECONDS FILE SENTENCE [TIMES]
     left=$(($1 * 10))
     while [ "$(cat "$2" 2>/dev/null | grep -cF -- "$3")" -lt "${4:-1}" ]; do
@@ -35,7 +26,7 @@ if [ $? -eq 77 ]; then
     exit 77
 fi
 
-if ! ldd "$build/facetd" | grep -q libusb; then
+if ! ldd "$facetd" | grep -q libusb; then
     echo "built without libusb: install libusb-1.0-0-dev (make deps)"
     exit 77
 fi
@@ -43,16 +34,15 @@ fi
 # Halted once, pulled out, plugged in again under another address.
 configure one usb:16160456
 "$bed" --scanner 1-1=16160456 --halt 2 --unplug 4,2 -- sh -c 'echo $$ >"$1/daemon"; exec "$0" --config "$1/one.yaml"' \
-    "$build/facetd" "$scratch" >"$scratch/one" 2>&1 &
+    "$facetd" "$scratch" >"$scratch/one" 2>&1 &
 bed_pid=$!
-pids="$pids $bed_pid"
 wait_for 20 "$scratch/one" "laser: streaming"
 wait_for 20 "$scratch/one" "laser: lost: the scanner at usb:1-1 is gone: unplugged, without power, or restarted"
 wait_for 20 "$scratch/one" "laser: not ready: usb:16160456: no scanner is plugged in on USB"
 wait_for 20 "$scratch/one" "bed: plugged in"
 wait_for 20 "$scratch/one" "laser: streaming" 2
 sleep 1
-"$build/facet" watch --once --json "unix:$scratch/one.sock" >"$scratch/status" || fail "facet watch"
+"$facet" watch --once --json "unix:$scratch/one.sock" >"$scratch/status" || fail "facet watch"
 python3 - "$scratch/status" "$scratch/one" <<'END' || { fail "what came over USB is not what was sent"; cat "$scratch/one"; }
 import json, re, sys
 status = json.load(open(sys.argv[1]))
@@ -75,13 +65,11 @@ wait $bed_pid || fail "the daemon ended with status $?"
 
 # Twins: `usb` alone says which two there are, a serial number finds its own.
 configure both usb
-timeout 20 "$bed" --scanner 1-1=16160456 --scanner 1-2=18220118 -- "$build/facetd" --config "$scratch/both.yaml" \
+timeout 20 "$bed" --scanner 1-1=16160456 --scanner 1-2=18220118 -- "$facetd" --config "$scratch/both.yaml" \
     >"$scratch/both" 2>&1 &
-pids="$pids $!"
 configure second usb:18220118
-timeout 20 "$bed" --scanner 1-1=16160456 --scanner 1-2=18220118 -- "$build/facetd" --config "$scratch/second.yaml" \
+timeout 20 "$bed" --scanner 1-1=16160456 --scanner 1-2=18220118 -- "$facetd" --config "$scratch/second.yaml" \
     >"$scratch/second" 2>&1 &
-pids="$pids $!"
 wait_for 20 "$scratch/both" "2 scanners are plugged in; write one of these as \`connect\`: usb:16160456, usb:18220118"
 wait_for 20 "$scratch/second" "bed: first request of 1-2"
 wait_for 20 "$scratch/second" "laser: streaming"

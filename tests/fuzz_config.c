@@ -5,6 +5,7 @@
 #include <stdlib.h>
 #include <string.h>
 
+#include "config/address.h"
 #include "config/config.h"
 #include "config/keys.h"
 
@@ -48,10 +49,27 @@ static void check_sentence(const char *text)
 		must(!iscntrl((unsigned char)*text));
 }
 
+/* The input as one address of any kind: what is taken is taken again as it is printed, but for the query of ws:. */
+static void check_address(const uint8_t *data, size_t size)
+{
+	struct address address, again;
+	char text[2 * ADDRESS_TEXT_MAX] = "", printed[ADDRESS_TEXT_MAX], error[ADDRESS_ERROR_MAX];
+	memcpy(text, data, size < sizeof(text) - 1 ? size : sizeof(text) - 1);
+	if (address_parse(text, ADDRESS_UNIX | ADDRESS_TCP | ADDRESS_UDP | ADDRESS_WS, &address, error))
+		return;
+	address_print(&address, printed);
+	must(address_parse(printed, address.kind, &again, error) == 0);
+	must(strcmp(address.path, again.path) == 0 && strcmp(address.host, again.host) == 0 &&
+	     address.port == again.port);
+	must(strncmp(address.target, again.target, strcspn(address.target, "?")) == 0);
+	must(!strpbrk(address.target, " \r\n"));
+}
+
 int LLVMFuzzerTestOneInput(const uint8_t *data, size_t size)
 {
 	static struct config config;
 	struct config_error error;
+	check_address(data, size);
 	const int status = config_read((const char *)data, size, "f.yaml", &config, &error);
 	if (status)
 		check_sentence(error.text);

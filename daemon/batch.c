@@ -1,7 +1,7 @@
 /* A batch is the map as of the step at which it began, and nothing is copied for it. What it will send follows from the
- * store: an entry is in it if it changed after what the client committed (begin) and not after the batch began (end), or
- * if it comes into the region or leaves it. How far it is follows from the last one sent: everything up to there in the
- * order is sent, everything behind is not.
+ * store as it was then (sheets_as_of): an entry is in it if it had changed after what the client committed (begin), or if it
+ * comes into the region or leaves it. How far it is follows from the last one sent: everything up to there in the order is
+ * sent, everything behind is not.
  *
  *     order:   removals, nearest first | patches, nearest first
  *              sent ... sent | window: the nearest unsent | not looked at yet
@@ -9,11 +9,8 @@
  *
  * Only the window is held. When it is used up, the store is looked through for the next ones: through the end of the list
  * of changes, or, where the region moved or the client holds nothing, through all of it. The cost of a batch therefore
- * follows what changed, as long as the region stays; the memory is the same whatever there is.
- *
- * When an entry changes that is still unsent, its sheet is pinned, in a list that has the same order; the next to be sent
- * is the first of window and pins. Entries of the window that changed are passed over: they have their pin. So what is
- * behind the window in the store is always either behind it in the order too, or pinned. */
+ * follows what changed, as long as the region stays; the memory is the same whatever there is. What the store keeps of an
+ * entry that changed meanwhile is kept until the batch has passed it: what has been sent is no longer looked for. */
 #include "daemon/batch.h"
 
 #include <assert.h>
@@ -25,19 +22,23 @@
 
 enum part { PART_NONE, PART_REMOVAL, PART_PATCH };
 
-/* What an entry, as it is, is to this batch. One that is gone is removed even where the client may never have had it: the
+/* What an entry, as it was, is to this batch. One that is gone is removed even where the client may never have had it: the
  * store does not know what it was at `begin`. */
 static enum part part_of(const struct batch *batch, const struct entry *entry)
 {
-	bool changed = entry->sequence > batch->begin;
-	bool had = !batch->whole && interest_has(&batch->from, entry->key);
-	bool has = entry->sheet && interest_has(&batch->to, entry->key);
+	struct sheet *sheet;
+	uint64_t sequence;
 
-	if (entry->sequence > batch->end)
+	if (!sheets_as_of(entry, batch->end, &sequence, &sheet))
 		return PART_NONE;
+
+	bool changed = sequence > batch->begin;
+	bool had = !batch->whole && interest_has(&batch->from, entry->key);
+	bool has = sheet && interest_has(&batch->to, entry->key);
+
 	if (has)
 		return changed || !had ? PART_PATCH : PART_NONE;
-	return had && (changed || entry->sheet) ? PART_REMOVAL : PART_NONE;
+	return had && (changed || sheet) ? PART_REMOVAL : PART_NONE;
 }
 
 /* Order */
@@ -65,6 +66,13 @@ static int compare_waiting(const void *a, const void *b)
 static bool is_sent(const struct batch *batch, uint64_t rank, struct patch_key key)
 {
 	return batch->started && compare(rank, key, batch->rank, batch->key) <= 0;
+}
+
+bool batch_needs(const struct batch *batch, const struct entry *entry)
+{
+	enum part part = part_of(batch, entry);
+
+	return part != PART_NONE && !is_sent(batch, rank_of(batch, entry->key, part), entry->key);
 }
 
 /* The window */
@@ -163,145 +171,46 @@ int batch_begin(struct batch *batch, const struct sheets *sheets, struct batch_s
 	return 0;
 }
 
-/* Pins */
-
-static uint64_t pin_rank(const struct batch *batch, const struct batch_pin *pin)
-{
-	return rank_of(batch, pin->entry->key, pin->sheet ? PART_PATCH : PART_REMOVAL);
-}
-
-/* Room for one more. Those that were sent make room first. */
-static int reserve_pin(struct batch *batch, struct sheets *sheets)
-{
-	size_t cap = batch->pins_cap ? batch->pins_cap * 2 : 64;
-	struct batch_pin *grown;
-
-	if (batch->pins < batch->pins_cap)
-		return 0;
-	if (batch->pin_at > 0) {
-		sheets->stats.pinned -= batch->pin_at * sizeof(*batch->pin);
-		batch->pins -= batch->pin_at;
-		memmove(batch->pin, batch->pin + batch->pin_at, batch->pins * sizeof(*batch->pin));
-		batch->pin_at = 0;
-		return 0;
-	}
-	if (batch->pins == BATCH_PINS_MAX)
-		return -ENOBUFS;
-	cap = cap > BATCH_PINS_MAX ? BATCH_PINS_MAX : cap;
-	grown = realloc(batch->pin, cap * sizeof(*grown));
-	if (!grown)
-		return -ENOMEM;
-	batch->pin = grown;
-	batch->pins_cap = cap;
-	return 0;
-}
-
-/* Where it belongs among those not yet sent. */
-static size_t pin_place(const struct batch *batch, uint64_t rank, struct patch_key key)
-{
-	size_t low = batch->pin_at, high = batch->pins;
-
-	while (low < high) {
-		size_t middle = low + (high - low) / 2;
-		const struct batch_pin *pin = &batch->pin[middle];
-
-		if (compare(pin_rank(batch, pin), pin->entry->key, rank, key) < 0)
-			low = middle + 1;
-		else
-			high = middle;
-	}
-	return low;
-}
-
-int batch_before_change(struct batch *batch, struct sheets *sheets, struct entry *entry)
-{
-	enum part part = part_of(batch, entry);
-	uint64_t rank = rank_of(batch, entry->key, part);
-	struct sheet *sheet = part == PART_PATCH ? entry->sheet : NULL;
-	size_t at;
-	int r;
-
-	if (part == PART_NONE || is_sent(batch, rank, entry->key))
-		return 0;
-	r = reserve_pin(batch, sheets);
-	if (r < 0)
-		return r;
-	at = pin_place(batch, rank, entry->key);
-	memmove(batch->pin + at + 1, batch->pin + at, (batch->pins - at) * sizeof(*batch->pin));
-	batch->pin[at] = (struct batch_pin){entry, sheet};
-	batch->pins++;
-	batch->pinned += sizeof(*batch->pin);
-	sheets->stats.pinned += sizeof(*batch->pin);
-	if (sheet) {
-		sheet->references++;
-		batch->pinned += sheet->len;
-	}
-	return 0;
-}
-
 /* Sending */
 
-static void take_pin(struct batch *batch, struct entry **ret_entry, struct sheet **ret_sheet)
+int batch_next(struct batch *batch, const struct sheets *sheets, struct batch_scratch *scratch,
+               struct entry **ret_entry, struct sheet **ret_sheet)
 {
-	struct batch_pin *pin = &batch->pin[batch->pin_at++];
-
-	batch->rank = pin_rank(batch, pin);
-	batch->pinned -= sizeof(*pin) + (pin->sheet ? pin->sheet->len : 0);
-	*ret_entry = pin->entry;
-	*ret_sheet = pin->sheet; /* with its reference */
-}
-
-static void take_waiting(struct batch *batch, struct entry **ret_entry, struct sheet **ret_sheet)
-{
-	const struct batch_waiting *waiting = &batch->window[batch->window_at++];
-
-	batch->rank = waiting->rank;
-	*ret_entry = waiting->entry;
-	*ret_sheet = waiting->rank >= RANK_PATCH ? waiting->entry->sheet : NULL;
-	if (*ret_sheet)
-		(*ret_sheet)->references++;
-}
-
-int batch_next(struct batch *batch, struct sheets *sheets, struct batch_scratch *scratch, struct entry **ret_entry,
-               struct sheet **ret_sheet)
-{
-	const struct batch_pin *pin;
 	const struct batch_waiting *waiting;
+	struct sheet *sheet = NULL;
+	uint64_t sequence;
 	int r;
 
 	if (batch->left == 0)
 		return 0;
-	while (batch->window_at < batch->window_n && batch->window[batch->window_at].entry->sequence > batch->end)
-		batch->window_at++; /* it has its pin */
-	if (batch->window_at == batch->window_n && batch->left > batch->pins - batch->pin_at) {
+	if (batch->window_at == batch->window_n) {
 		r = fill_window(batch, sheets, scratch, NULL);
 		if (r < 0)
 			return r;
 	}
-	pin = batch->pin_at < batch->pins ? &batch->pin[batch->pin_at] : NULL;
-	waiting = batch->window_at < batch->window_n ? &batch->window[batch->window_at] : NULL;
-	assert(pin || waiting);
-	if (!waiting || (pin && compare(pin_rank(batch, pin), pin->entry->key, waiting->rank, waiting->entry->key) < 0))
-		take_pin(batch, ret_entry, ret_sheet);
-	else
-		take_waiting(batch, ret_entry, ret_sheet);
+	assert(batch->window_at < batch->window_n);
+	waiting = &batch->window[batch->window_at++];
+	if (waiting->rank >= RANK_PATCH) {
+		sheets_as_of(waiting->entry, batch->end, &sequence, &sheet);
+		sheet->references++;
+	}
 	batch->started = true;
-	batch->key = (*ret_entry)->key;
+	batch->rank = waiting->rank;
+	batch->key = waiting->entry->key;
 	batch->left--;
+	*ret_entry = waiting->entry;
+	*ret_sheet = sheet;
 	return 1;
 }
 
-void batch_finish(struct batch *batch, struct sheets *sheets)
+void batch_finish(struct batch *batch)
 {
-	while (batch->pin_at < batch->pins)
-		sheet_unref(sheets, batch->pin[batch->pin_at++].sheet);
-	sheets->stats.pinned -= batch->pins * sizeof(*batch->pin);
-	free(batch->pin);
+	assert(!batch->past);
 	free(batch->window);
 	*batch = (struct batch){0};
 }
 
 size_t batch_bytes(const struct batch *batch)
 {
-	return batch->pins_cap * sizeof(*batch->pin) + batch->window_cap * sizeof(*batch->window);
+	return batch->window_cap * sizeof(*batch->window);
 }

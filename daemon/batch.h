@@ -7,17 +7,11 @@
 
 #define BATCH_WINDOW \
 	1024 /* the nearest unsent ones that are held at a time; when they are sent, the next are looked up */
-#define BATCH_PINS_MAX 1900 /* a batch under which more changes is given up */
 
 /* Where something stands in the order: removals, then patches, both by distance from the origin, then by key. */
 struct batch_waiting {
 	uint64_t rank;
 	struct entry *entry;
-};
-
-struct batch_pin {
-	struct entry *entry;
-	struct sheet *sheet; /* NULL: a removal */
 };
 
 struct batch {
@@ -31,9 +25,7 @@ struct batch {
 	size_t left; /* announced and not sent */
 	struct batch_waiting *window;
 	size_t window_at, window_n, window_cap;
-	struct batch_pin *pin; /* in the order of sending; what is before pin_at was sent */
-	size_t pin_at, pins, pins_cap;
-	size_t pinned; /* bytes of sheets among the pins not yet sent, and of the pins */
+	struct past *past; /* what is kept for it, and maybe for some that began before */
 };
 
 /* Shared by all batches: memory in which a window is made. */
@@ -48,14 +40,13 @@ int batch_begin(struct batch *, const struct sheets *, struct batch_scratch *, u
 
 /* The next one: 1, with its entry, and its sheet (a reference for the caller) unless it is a removal; 0 at the end;
  * -ENOMEM. */
-int batch_next(struct batch *, struct sheets *, struct batch_scratch *, struct entry **ret_entry,
+int batch_next(struct batch *, const struct sheets *, struct batch_scratch *, struct entry **ret_entry,
                struct sheet **ret_sheet);
 
-/* `entry` is about to change: it is pinned as it is if the batch has still to send it. 0; -ENOBUFS: the list of pins is
- * full; -ENOMEM. */
-int batch_before_change(struct batch *, struct sheets *, struct entry *);
+/* The entry, as it was when the batch began, is still to be sent. */
+bool batch_needs(const struct batch *, const struct entry *);
 
-void batch_finish(struct batch *, struct sheets *); /* all zero again */
-size_t batch_bytes(const struct batch *);           /* memory of its own */
+void batch_finish(struct batch *);        /* all zero again; what was kept has been let go */
+size_t batch_bytes(const struct batch *); /* memory of its own */
 
 #endif

@@ -1,16 +1,18 @@
 /* Clients and their walks.
  *
  * A client is what it last committed: a place in the order of changes, a step and a region (law L6). What it misses
- * follows from these and the store (sheets.h), and is walked as a batch (batch.h), which is given up when it pins too
- * much: the next one begins at the newest step. So a slow client skips what lies between and costs no memory.
+ * follows from these and the store (sheets.h), and is walked as a batch (batch.h). What the map was when batches began is
+ * kept for all of them in common; when that is too much, the batch that began first is given up: the next one begins at
+ * the newest step. So a slow client skips what lies between and costs no memory.
  *
  *      idle ── walk_begin ──► walking ── walk_commit ──► idle
  *                                │
- *                                └─ too much pinned, map begun anew, dismissed ──► cancelled ── told once ──► idle
+ *                                └─ too much kept,   map begun anew, dismissed ──► cancelled ── told once ──► idle
  *
- * A change asks only the batches that began after the entry's last change, whose end therefore lies behind it: these are
- * the latest ones, so the walking clients stand in the order in which they began. What changes all the time has soon
- * changed since a stalled client began, which then costs nothing more. */
+ * Walking clients stand in the order in which they began. A change asks them from the last one on, until one needs what is
+ * about to change, which is then kept for all, or has begun before the entry's last change, as all before it have. The
+ * first one who stalls needs nearly everything, so however many there are, one is asked. Who ends a batch hands on what it
+ * held to the next one who needs it. */
 #include "daemon/publisher_client.h"
 
 #include <assert.h>
@@ -50,6 +52,34 @@ static void note_bytes(struct publisher_client *client)
 		client->publisher->clients_peak_bytes = bytes;
 }
 
+/* The next one, from `client` on to those that began earlier, who needs what the entry was from `sequence` on. */
+static struct publisher_client *who_needs(struct publisher_client *client, const struct entry *entry, uint64_t sequence)
+{
+	for (; client && client->batch.end >= sequence; client = client->earlier) {
+		client->publisher->sheets.stats.asked++;
+		if (batch_needs(&client->batch, entry))
+			return client;
+	}
+	return NULL;
+}
+
+static void hand_on(struct publisher_client *client)
+{
+	struct past *past;
+
+	while ((past = client->batch.past) != NULL) {
+		struct publisher_client *to = who_needs(client->earlier, past->entry, past->sequence);
+
+		client->batch.past = past->next;
+		if (to) {
+			past->next = to->batch.past;
+			to->batch.past = past;
+		} else {
+			sheets_let_go(&client->publisher->sheets, past);
+		}
+	}
+}
+
 /* Ends a walk; what was handed out last stays with the client. */
 static void stop_walking(struct publisher_client *client)
 {
@@ -57,12 +87,12 @@ static void stop_walking(struct publisher_client *client)
 
 	if (client->state != CLIENT_WALKING)
 		return;
+	hand_on(client);
 	*(client->later ? &client->later->earlier : &p->latest) = client->earlier;
-	if (client->earlier)
-		client->earlier->later = client->later;
+	*(client->earlier ? &client->earlier->later : &p->oldest) = client->later;
 	client->earlier = client->later = NULL;
 	note_bytes(client);
-	batch_finish(&client->batch, &p->sheets);
+	batch_finish(&client->batch);
 	client->state = CLIENT_IDLE;
 }
 
@@ -105,17 +135,11 @@ void publisher_dismiss(struct publisher_client *client, const char *reason)
 
 static void before_change(struct publisher *p, struct entry *entry)
 {
-	struct publisher_client *client = p->latest, *earlier;
+	struct publisher_client *client = who_needs(p->latest, entry, entry->sequence);
 
-	for (; client && client->batch.end >= entry->sequence; client = earlier) {
-		int r = batch_before_change(&client->batch, &p->sheets, entry);
-
-		earlier = client->earlier;
-		if (r == -ENOBUFS)
-			cancel_slow(client);
-		else if (r < 0)
+	if (client && sheets_keep(&p->sheets, entry, &client->batch.past) < 0)
+		for (; client; client = who_needs(p->latest, entry, entry->sequence))
 			cancel(client);
-	}
 }
 
 static int publish_patch(struct publisher *p, const struct patch *patch, uint32_t faces_raw)
@@ -136,22 +160,14 @@ static int publish_patch(struct publisher *p, const struct patch *patch, uint32_
 	return 0;
 }
 
-/* Aborts the batches that pin most until what lives for them alone is within its limit. What snapshots hold is limited by
- * their number. */
+/* Aborts the batches that began first until what lives for batches alone is within its limit. What snapshots hold is limited
+ * by their number; what is left when nothing is kept are frames half written, one a client. */
 static void limit_pins(struct publisher *p)
 {
 	size_t max = p->params.pinned_max + p->snapshot_bytes;
 
-	while (p->sheets.stats.pinned > max) {
-		struct publisher_client *most = NULL;
-
-		for (struct publisher_client *client = p->latest; client; client = client->earlier)
-			if (client->batch.pinned > 0 && (!most || client->batch.pinned > most->batch.pinned))
-				most = client;
-		if (!most)
-			return; /* what is left are frames half written, one a client */
-		cancel_slow(most);
-	}
+	while (p->sheets.stats.pinned > max && p->sheets.pasts > 0)
+		cancel_slow(p->oldest);
 }
 
 int publisher_publish(struct publisher *p, uint64_t step, struct patch *const *patches, const uint32_t *faces_raw,
@@ -251,15 +267,14 @@ int publisher_walk_begin(struct publisher_client *client, struct native_begin *r
 	                        .origin = p->robot};
 	r = batch_begin(batch, &p->sheets, &p->scratch, &begin.patches, &begin.removals);
 	if (r < 0) {
-		batch_finish(batch, &p->sheets);
+		batch_finish(batch);
 		return r;
 	}
 	client->state = CLIENT_WALKING;
 	client->batch_step = p->step;
 	client->later = NULL;
 	client->earlier = p->latest;
-	if (p->latest)
-		p->latest->later = client;
+	*(p->latest ? &p->latest->later : &p->oldest) = client;
 	p->latest = client;
 	*ret = begin;
 	return 1;
@@ -398,7 +413,6 @@ void publisher_client_stats(const struct publisher_client *client, struct publis
 	ret->behind_steps = behind(client);
 	if (ret->behind_peak < ret->behind_steps)
 		ret->behind_peak = ret->behind_steps;
-	ret->queued = client->batch.pinned;
 	ret->bytes = client_bytes(client);
 	if (stream) {
 		ret->queued += native_stream_queued(stream);

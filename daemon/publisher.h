@@ -9,11 +9,10 @@
 
 #include "core/native.h"
 
-/* Bytes that live only because a batch pins them, over all clients; beyond, the batch that pins most is aborted and
- * begun again at the newest step. */
+/* Bytes that live only because a batch that began before may send them, over all clients; beyond, the batch that began first
+ * is aborted, and begun again at the newest step. */
 #define PUBLISHER_PINNED_MAX (32u << 20)
-/* What one client may cost besides its JSON messages: write buffer, window and list of pins. A batch that would need
- * more is aborted likewise. */
+/* What one client may cost besides its JSON messages: write buffer and window. */
 #define PUBLISHER_CLIENT_MAX    (64u << 10)
 #define PUBLISHER_ABORTS_MAX    3           /* so many running: the client is closed with the reason */
 #define PUBLISHER_JSON_MAX      (64u << 10) /* of one client, waiting; a message beyond is dropped and counted */
@@ -86,10 +85,11 @@ struct publisher_stats {
 	uint32_t generation;
 	size_t patches, bytes; /* living, encoded */
 	uint64_t faces, faces_raw;
-	size_t pinned;                      /* bytes that live only because they are pinned, and of what batches note */
+	size_t pinned;                      /* bytes that live only because a batch or a snapshot may need them */
 	size_t clients, clients_peak_bytes; /* the most that one client ever cost, its JSON messages apart */
 	uint64_t encodes[PUBLISHER_FORMS];  /* so often was a patch made into that form */
 	size_t forms_bytes;                 /* kept of forms other than NATIVE */
+	uint64_t asked;                     /* so often was a batch asked whether it needs what a patch was */
 };
 void publisher_stats(const struct publisher *, struct publisher_stats *ret);
 
@@ -154,8 +154,8 @@ struct publisher_client_stats {
 	uint64_t step;         /* last committed */
 	uint64_t behind_steps; /* the newest step is so many further */
 	uint64_t behind_peak;  /* the most that ever were */
-	size_t queued;         /* bytes it holds: begun frame, messages, pins */
-	size_t bytes;          /* it costs: its structure, write buffer, window and list of pins, messages */
+	size_t queued;         /* bytes it holds: begun frame, messages */
+	size_t bytes;          /* it costs: its structure, write buffer, window, messages */
 	uint64_t batches, aborts, skipped_json;
 	uint64_t sent; /* bytes; 0 of walks */
 };

@@ -44,7 +44,7 @@ struct publisher_client {
 };
 
 _Static_assert(sizeof(struct publisher_client) + sizeof(struct native_stream) +
-                       BATCH_WINDOW * sizeof(struct batch_waiting) + BATCH_PINS_MAX * sizeof(struct batch_pin) <=
+                       BATCH_WINDOW * sizeof(struct batch_waiting) <=
                    PUBLISHER_CLIENT_MAX,
                "a client costs no more than is said");
 
@@ -56,7 +56,7 @@ struct publisher {
 	struct sheets sheets;
 	struct batch_scratch scratch;
 	struct publisher_client *clients;
-	struct publisher_client *latest; /* of those that walk: its batch began last */
+	struct publisher_client *oldest, *latest; /* of those that walk: its batch began first, last */
 	size_t clients_n, clients_peak_bytes;
 	int snapshots;
 	size_t snapshot_bytes;

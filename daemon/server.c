@@ -8,6 +8,10 @@
  * not another's latency; what is read and not yet heard waits for the next turn, and nothing more is read until then.
  * A client that is to be closed keeps its socket for a second at most, to take the reason.
  *
+ * Whoever has been written all there is stands in a list: news go to those, and to nobody else. Who waits for room in his
+ * socket comes back when there is some, who wanted a limited rate with the timer. So clients that do not read cost
+ * publishing nothing.
+ *
  * Questions of a client that does not read its answers wait in its socket: its own sends then block, nobody else's. */
 #include "daemon/server.h"
 
@@ -39,6 +43,7 @@ enum kind { KIND_UNKNOWN, KIND_NATIVE, KIND_LINES };
 struct connection {
 	struct server *server;
 	struct connection *next;
+	struct connection *next_ready, **ready_at; /* ready_at NULL: not in the list */
 	uv_poll_t poll;
 	int fd, events;
 	enum kind kind;
@@ -76,11 +81,41 @@ struct server {
 	unsigned ticks;
 	struct buffer status; /* the last one built */
 	int64_t status_ns;
-	struct connection *connections;
-	size_t count; /* of connections, those that are told to go included */
+	struct connection *connections, *ready;
+	uint64_t visits; /* of those that were ready, for news */
+	size_t count;    /* of connections, those that are told to go included */
 	uint64_t next_id;
 	bool stopped, ending;
 };
+
+/* The list of those that take news at once */
+
+static void leave_ready(struct connection *c)
+{
+	if (!c->ready_at)
+		return;
+	*c->ready_at = c->next_ready;
+	if (c->next_ready)
+		c->next_ready->ready_at = c->ready_at;
+	c->ready_at = NULL;
+}
+
+static void set_ready(struct connection *c, bool ready)
+{
+	struct server *s = c->server;
+
+	if (ready == (c->ready_at != NULL))
+		return;
+	if (!ready) {
+		leave_ready(c);
+		return;
+	}
+	c->next_ready = s->ready;
+	c->ready_at = &s->ready;
+	if (s->ready)
+		s->ready->ready_at = &c->next_ready;
+	s->ready = c;
+}
 
 /* Closing */
 
@@ -103,6 +138,7 @@ static void close_connection(struct connection *c)
 	if (c->closing)
 		return;
 	c->closing = true;
+	leave_ready(c);
 	while (*at != c)
 		at = &(*at)->next;
 	*at = c->next;
@@ -207,6 +243,14 @@ static bool is_done(const struct connection *c)
 	return c->out.error || (c->out.len == 0 && !c->stream && (c->dismissed || (c->ended && !unheard)));
 }
 
+/* It wanted a limited rate, and has had what is due: the timer comes back to it. */
+static bool is_paced(const struct connection *c, int64_t t_ns)
+{
+	int64_t deadline_ns = publisher_deadline(c->client);
+
+	return deadline_ns != INT64_MAX && deadline_ns > t_ns;
+}
+
 /* Its next message may be heard, if there is one: there is room for the answer. */
 static bool can_hear(const struct connection *c)
 {
@@ -244,8 +288,10 @@ static void pump(struct connection *c)
 		c->deadline_ns = t_ns + SERVER_LINGER_NS;
 	if (c->more && can_hear(c))
 		uv_idle_start(&c->server->hearing, on_hearing);
+	full = full || total >= SERVER_TURN_BYTES;
+	set_ready(c, c->client && !full && !is_paced(c, t_ns));
 	set_events(c, (c->ended || c->dismissed || c->more || c->out.len > SERVER_LINES_MAX ? 0 : UV_READABLE) |
-	                  (full || total >= SERVER_TURN_BYTES ? UV_WRITABLE : 0));
+	                  (full ? UV_WRITABLE : 0));
 }
 
 /* Speaking */
@@ -676,11 +722,16 @@ void server_wake(struct server *s)
 {
 	struct connection *next;
 
-	for (struct connection *c = s->connections; c; c = next) {
-		next = c->next;
-		if (c->client && !(c->events & UV_WRITABLE)) /* else its socket is full */
-			pump(c);
+	for (struct connection *c = s->ready; c; c = next) {
+		next = c->next_ready;
+		s->visits++;
+		pump(c);
 	}
+}
+
+uint64_t server_visits(const struct server *s)
+{
+	return s->visits;
 }
 
 void server_streams(struct server *s)

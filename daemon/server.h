@@ -50,6 +50,9 @@ const char *server_address(const struct server *, int i);
 /* How many of its sockets systemd had opened. */
 int server_passed(const struct server *);
 
+/* So often was a client looked at because there was news. */
+uint64_t server_visits(const struct server *);
+
 /* Fills at most `cap` clients; how many there are. */
 size_t server_clients(const struct server *, struct control_client *ret, size_t cap);
 

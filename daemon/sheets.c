@@ -8,8 +8,12 @@
  * which has a cap, ever had patches. Sequence numbers serve where steps would not: two sets may have one step.
  *
  * Other *forms* of a sheet are made from its frame when somebody first asks, and kept up to a limit; beyond, the one used
- * longest ago goes, and is made again if somebody asks again. A sheet that was replaced keeps its forms while a pin holds
- * it: all clients in the middle of a batch will ask for them. */
+ * longest ago goes, and is made again if somebody asks again. A sheet that was replaced keeps its forms while it is
+ * held: all clients in the middle of a batch will ask for them.
+ *
+ * A batch sends the map as it was when it began. So what an entry was is kept when it changes (a *past*) as long as a batch
+ * that began before has still to send it: once for all of them. As of a batch, an entry is its newest state that is not
+ * newer than the batch. */
 #include "daemon/sheets.h"
 
 #include <assert.h>
@@ -238,6 +242,59 @@ struct entry *sheets_touch(struct sheets *s, struct patch_key key)
 	return *slot;
 }
 
+/* What was */
+
+int sheets_keep(struct sheets *s, struct entry *entry, struct past **list)
+{
+	struct past *past = malloc(sizeof(*past));
+
+	if (!past)
+		return -ENOMEM;
+	*past = (struct past){.entry = entry,
+	                      .sequence = entry->sequence,
+	                      .until = s->sequence + 1,
+	                      .sheet = entry->sheet,
+	                      .older = entry->past,
+	                      .next = *list};
+	if (past->sheet)
+		past->sheet->references++;
+	if (past->older)
+		past->older->newer = past;
+	entry->past = *list = past;
+	s->pasts++;
+	s->stats.pinned += sizeof(*past);
+	return 0;
+}
+
+void sheets_let_go(struct sheets *s, struct past *past)
+{
+	*(past->newer ? &past->newer->older : &past->entry->past) = past->older;
+	if (past->older)
+		past->older->newer = past->newer;
+	s->pasts--;
+	s->stats.pinned -= sizeof(*past);
+	sheet_unref(s, past->sheet);
+	free(past);
+}
+
+bool sheets_as_of(const struct entry *entry, uint64_t sequence, uint64_t *ret_changed, struct sheet **ret_sheet)
+{
+	const struct past *past = entry->past;
+
+	if (entry->sequence <= sequence) {
+		*ret_changed = entry->sequence;
+		*ret_sheet = entry->sheet;
+		return true;
+	}
+	while (past && past->sequence > sequence)
+		past = past->older;
+	if (!past || past->until <= sequence)
+		return false;
+	*ret_changed = past->sequence;
+	*ret_sheet = past->sheet;
+	return true;
+}
+
 /* The store's own reference moves from the old sheet to the new one. */
 static void replace_sheet(struct sheets *s, struct entry *entry, struct sheet *sheet)
 {
@@ -297,6 +354,7 @@ struct sheet *sheets_detach(struct sheets *s, struct entry *entry)
 
 void sheets_clear(struct sheets *s)
 {
+	assert(s->pasts == 0);
 	for (size_t i = 0; i < s->entries; i++)
 		replace_sheet(s, sheets_entry(s, i), NULL);
 	while (s->chunks > 0)

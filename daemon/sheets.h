@@ -28,12 +28,23 @@ struct sheet {
 	uint8_t bytes[]; /* a PATCH frame */
 };
 
+/* What an entry was before a change, kept while a batch that began earlier has still to send it: once for all such batches,
+ * in the list of one of them. */
+struct past {
+	struct entry *entry;
+	uint64_t sequence, until;   /* of the change that made it, of the one that ended it */
+	struct sheet *sheet;        /* counted; NULL: the patch was gone */
+	struct past *older, *newer; /* of the entry */
+	struct past *next;          /* of the list */
+};
+
 /* What became of a key. Entries stay where they are, and when their patch is gone, until the map ends. */
 struct entry {
 	struct patch_key key;
 	uint64_t sequence;   /* of its last change */
 	struct sheet *sheet; /* NULL: the patch is gone */
 	struct entry *older, *newer;
+	struct past *past; /* the newest */
 };
 
 struct sheets {
@@ -43,6 +54,7 @@ struct sheets {
 	size_t chunks, entries;
 	struct entry *oldest, *newest;
 	uint64_t sequence;                      /* of the newest change */
+	size_t pasts;                           /* kept ones */
 	struct form *form_oldest, *form_newest; /* kept ones, by their last use */
 	size_t forms_max;
 	struct publisher_encoder encoder[PUBLISHER_FORMS];
@@ -66,6 +78,12 @@ void sheet_unref(struct sheets *, struct sheet *); /* of NULL: nothing */
 struct entry *sheets_touch(struct sheets *, struct patch_key);
 /* `sheet` (or NULL: gone), taken over, takes the place of what the entry holds, as the newest change. */
 void sheets_change(struct sheets *, struct entry *, struct sheet *);
+/* Keeps what the entry is, which is about to change, at the front of `list`. 0 or -ENOMEM. */
+int sheets_keep(struct sheets *, struct entry *, struct past **list);
+void sheets_let_go(struct sheets *, struct past *); /* it is in no list */
+/* What the entry was when `sequence` was the newest change: its last change up to then, and its sheet (borrowed; NULL:
+ * gone). False: it had not come yet, or that was not kept. */
+bool sheets_as_of(const struct entry *, uint64_t sequence, uint64_t *ret_changed, struct sheet **ret_sheet);
 /* The entry's sheet, to another owner, who frees it; the entry is as if gone. One that somebody else holds is copied.
  * NULL when memory is out. */
 struct sheet *sheets_detach(struct sheets *, struct entry *);

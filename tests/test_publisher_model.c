@@ -163,9 +163,12 @@ static struct native_want random_wish(void)
 static void say_want(struct crowd *m, struct peer *peer, const struct native_want *want)
 {
 	struct buffer b = {0};
+	ssize_t n;
 
 	native_put_want(&b, want);
-	assert_int_equal(send(peer->fd, b.data, b.len, MSG_NOSIGNAL), (ssize_t)b.len);
+	n = send(peer->fd, b.data, b.len, MSG_NOSIGNAL);
+	/* One that was too slow may have been closed before it has read so. */
+	assert_true(n == (ssize_t)b.len || (n < 0 && (errno == EPIPE || errno == ECONNRESET)));
 	buffer_finish(&b);
 	peer->reader.want = *want;
 	peer->reader.want.flags |= NATIVE_WANT_ZSTD; /* may be on its way from before */

@@ -423,6 +423,46 @@ static void stalled_clients_pin_what_they_lack_and_no_change_more(void **state)
 	publisher_destroy(p);
 }
 
+/* Stalled in as many different steps as there are, or in one: a change asks one of them. */
+static void a_change_asks_one_of_however_many_stalled_clients(void **state)
+{
+	unsigned encoded = 0;
+	struct publisher *p = start_named(&encoded, 0);
+	struct publisher_client *client[150];
+	struct publisher_stats before, after;
+	struct publisher_item item;
+	struct native_begin begin;
+
+	(void)state;
+	publish_keys(p, 1, 0, 1000, 7);
+	for (uint64_t step = 2; step < 152; step++) {
+		client[step - 2] = join_walk(p, 0, 0, PUBLISHER_NATIVE);
+		assert_int_equal(publisher_walk_begin(client[step - 2], &begin), 1);
+		publisher_stats(p, &before);
+		publish_keys(p, step, (uint32_t)step, 60, (uint32_t)step);
+		publisher_stats(p, &after);
+		assert_int_equal(after.asked - before.asked, 60);
+	}
+	publish_keys(p, 152, 152, 58, 1); /* changed since all of them began */
+	publisher_stats(p, &before);
+	assert_int_equal(before.asked, after.asked);
+	for (int i = 0; i < 150; i++) { /* in any order: what the others need stays */
+		const int at = i * 67 % 150;
+
+		for (int n = 0; n < 1000; n++) {
+			assert_int_equal(publisher_walk_next(client[at], &item), 1);
+			const int64_t key = item.key.x + KEYS / 2, last = key < at + 1 ? key : at + 1;
+
+			assert_int_equal(item.version, last >= 2 && last > key - 60 ? last : 1);
+		}
+		assert_int_equal(publisher_walk_next(client[at], &item), 0);
+		publisher_leave(client[at]);
+	}
+	publisher_stats(p, &after);
+	assert_int_equal(after.pinned, 0);
+	publisher_destroy(p);
+}
+
 static double cpu_s(void)
 {
 	struct timespec t;
@@ -478,6 +518,7 @@ int main(void)
 	    cmocka_unit_test(a_radius_holds_all_that_is_within_and_little_more),
 	    cmocka_unit_test(a_pinned_step_stays_as_it_was),
 	    cmocka_unit_test(stalled_clients_pin_what_they_lack_and_no_change_more),
+	    cmocka_unit_test(a_change_asks_one_of_however_many_stalled_clients),
 	    cmocka_unit_test(a_step_beside_stalled_clients_is_measured),
 	};
 

@@ -723,6 +723,51 @@ static void a_stalled_client_does_not_hold_the_others_and_converges_when_it_read
 	peer_close(&late);
 }
 
+/* A hundred and fifty whose sockets are full, and one that wanted few bytes a second and had them. */
+static void news_go_past_those_who_cannot_take_any(void **state)
+{
+	static struct peer stalled[150];
+	struct peer quick, paced;
+	struct native_want few = {.bytes_per_s = 1000};
+	struct buffer b = {0};
+	uint64_t visits;
+
+	(void)state;
+	config.listen.clients = 152;
+	publish_step(16);
+	for (int i = 0; i < 150; i++) {
+		peer_unix(&stalled[i]);
+		peer_want(&stalled[i]);
+		turn(3);
+	}
+	peer_unix(&quick);
+	peer_want(&quick);
+	peer_unix(&paced);
+	native_put_want(&b, &few);
+	peer_say(&paced, b.data, b.len);
+	buffer_finish(&b);
+	expect_whole_map(&quick);
+	turn(10);
+	visits = server_visits(server);
+	for (int i = 0; i < 20; i++) {
+		publish_step(16);
+		expect_whole_map(&quick);
+	}
+	assert_int_equal(server_visits(server) - visits, 20);
+	for (int i = 0; i < 150; i++) {
+		expect_whole_map(&stalled[i]);
+		peer_close(&stalled[i]);
+	}
+	for (int i = 0; i < 20; i++) {
+		virtual_ns += 40 * SECOND; /* the timer comes back to it */
+		turn_until(has_bytes, &paced);
+		paced.want_bytes = paced.in.len + 100;
+	}
+	assert_true(paced.in.len > 2000);
+	peer_close(&paced);
+	peer_close(&quick);
+}
+
 static bool nobody_is_left(void *ctx)
 {
 	struct control_client client[8];
@@ -836,6 +881,7 @@ int main(void)
 	    CLAIM(no_status_is_built_for_a_client_that_has_no_room_for_it),
 	    CLAIM(a_client_that_ends_its_half_still_gets_its_answers),
 	    CLAIM(a_stalled_client_does_not_hold_the_others_and_converges_when_it_reads),
+	    CLAIM(news_go_past_those_who_cannot_take_any),
 	    CLAIM(clients_that_vanish_in_a_batch_leave_nothing_behind),
 	    CLAIM(every_impossible_address_has_its_sentence),
 	    CLAIM(a_dead_sockets_file_is_replaced_and_the_mode_is_0660),

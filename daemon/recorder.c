@@ -6,18 +6,16 @@
  * under their final name: a recording that was cut is a recording. A file that could not take its first chunk is removed. */
 #include "daemon/recorder.h"
 
-#include <dirent.h>
 #include <errno.h>
-#include <fcntl.h>
 #include <pthread.h>
 #include <stdio.h>
 #include <stdlib.h>
 #include <string.h>
-#include <sys/stat.h>
-#include <sys/statvfs.h>
 #include <syslog.h>
 #include <time.h>
 #include <unistd.h>
+
+#include "daemon/recording_folder.h"
 
 #define NOTICES_MAX   4 /* not yet taken; further ones are dropped */
 #define WAKE_BYTES    (256u << 10)
@@ -25,7 +23,6 @@
 #define RETRY_MAX_NS  INT64_C(60000000000)
 #define AGE_MIN_NS    INT64_C(1000000000) /* of a file that is ended because of its size */
 #define KEEP_CHECK    (1u << 20)          /* bytes written between two looks at the folder */
-#define NAMES_MAX     10000               /* files looked at in the folder */
 #define LEVEL         1                   /* of zstd */
 #define KEEP_PARTS    4                   /* files that `keep` holds where max_size says nothing */
 #define RECORDER_NAME "facetd-recorder"
@@ -60,7 +57,7 @@ struct place {
 	int64_t begun_ns;
 	uint32_t chunks;
 	bool begun; /* a whole chunk is there */
-	char path[512];
+	char path[RECORDING_PATH_MAX];
 };
 
 struct recorder {
@@ -437,110 +434,10 @@ static void end_place(struct recorder *r, const char *reason)
 		end_stream(r, reason);
 }
 
-/* The folder */
-
-struct names {
-	char name[NAMES_MAX][48];
-	size_t n;
-};
-
-/* 20261123T001530Z-0123abcd.mcap, perhaps with -2 before the dot: ours. */
-static bool is_ours(const char *name)
-{
-	static const char pattern[] = "########T######Z-";
-	size_t len = strlen(name);
-
-	if (len < 30 || len >= sizeof(((struct names *)0)->name[0]) || strcmp(name + len - 5, ".mcap") != 0)
-		return false;
-	for (size_t i = 0; pattern[i]; i++)
-		if (pattern[i] == '#' ? name[i] < '0' || name[i] > '9' : name[i] != pattern[i])
-			return false;
-	return strspn(name + 17, "0123456789abcdef") >= 8;
-}
-
-static int compare_names(const void *a, const void *b)
-{
-	return strcmp(a, b);
-}
-
-static uint64_t file_size(int folder, const char *name)
-{
-	struct stat st;
-
-	return fstatat(folder, name, &st, AT_SYMLINK_NOFOLLOW) == 0 && S_ISREG(st.st_mode) ? (uint64_t)st.st_size : 0;
-}
-
-static void list_names(DIR *folder, struct names *ret)
-{
-	struct dirent *entry;
-
-	ret->n = 0;
-	while (ret->n < NAMES_MAX && (entry = readdir(folder)) != NULL)
-		if (is_ours(entry->d_name))
-			snprintf(ret->name[ret->n++], sizeof(ret->name[0]), "%.47s", entry->d_name);
-	qsort(ret->name, ret->n, sizeof(ret->name[0]), compare_names);
-}
-
-/* The oldest recordings go until all of them, the one being written included, are within `keep`. */
 static void keep_limit(struct recorder *r)
 {
-	struct names *names = malloc(sizeof(*names));
-	DIR *folder = opendir(r->dir);
-	const char *current = strrchr(r->place.path, '/') + 1;
-	uint64_t total = 0;
-
 	r->place.checked = r->place.bytes;
-	if (names && folder) {
-		list_names(folder, names);
-		for (size_t i = 0; i < names->n; i++)
-			total += file_size(dirfd(folder), names->name[i]);
-		for (size_t i = 0; i < names->n && total > r->params.config->record.keep; i++) {
-			uint64_t size = file_size(dirfd(folder), names->name[i]);
-
-			if (strcmp(names->name[i], current) != 0 && unlinkat(dirfd(folder), names->name[i], 0) == 0)
-				total -= size;
-		}
-	}
-	if (folder)
-		closedir(folder);
-	free(names);
-}
-
-/* -errno: there is no room, or no folder. */
-static int look_for_room(const struct recorder *r)
-{
-	struct statvfs fs;
-
-	if (mkdir(r->dir, 0755) < 0 && errno != EEXIST)
-		return -errno;
-	if (statvfs(r->dir, &fs) < 0)
-		return -errno;
-	if (fs.f_flag & ST_RDONLY)
-		return -EROFS;
-	return (uint64_t)fs.f_bavail * fs.f_frsize < RECORDER_ROOM_BYTES ? -ENOSPC : 0;
-}
-
-/* The folder's next file. 0 or -errno. */
-static int open_file(struct recorder *r, const struct recording_begin *begin)
-{
-	struct place *p = &r->place;
-	const time_t seconds = (time_t)(begin->log_ns / 1000000000);
-	char stamp[32], more[16] = "";
-	struct tm tm;
-	int result = look_for_room(r);
-
-	strftime(stamp, sizeof(stamp), "%Y%m%dT%H%M%SZ", gmtime_r(&seconds, &tm));
-	for (int i = 2; p->fd < 0 && i < 100; i++) {
-		snprintf(p->path, sizeof(p->path), "%.400s/%s-%02x%02x%02x%02x%s.mcap", r->dir, stamp, begin->map_id[0],
-		         begin->map_id[1], begin->map_id[2], begin->map_id[3], more);
-		snprintf(more, sizeof(more), "-%d", i);
-		if (result < 0)
-			return result;
-		p->fd = open(p->path, O_WRONLY | O_CREAT | O_EXCL | O_CLOEXEC, 0640);
-		if (p->fd < 0 && errno != EEXIST)
-			return -errno;
-	}
-	return p->fd < 0 ? -EEXIST : 0;
+	recording_folder_keep(r->dir, r->params.config->record.keep, r->place.path);
 }
 
 static void began(struct recorder *r)
@@ -574,7 +471,11 @@ static void begin_place(struct recorder *r, const struct recording_begin *begin)
 	p->out = (struct buffer){0};
 	p->path[0] = 0;
 	if (r->dir)
-		result = open_file(r, begin);
+		result = recording_folder_open(r->dir, begin, p->path);
+	if (r->dir && result >= 0) {
+		p->fd = result;
+		result = 0;
+	}
 	if (result == 0)
 		p->writer = recording_writer_create(&params, begin, &p->out);
 	if (result == 0 && !p->writer)

@@ -20,9 +20,7 @@
 #include <assert.h>
 #include <errno.h>
 #include <fcntl.h>
-#include <libwebsockets.h>
 #include <netdb.h>
-#include <netinet/in.h>
 #include <netinet/tcp.h>
 #include <stdio.h>
 #include <stdlib.h>
@@ -32,100 +30,33 @@
 #include <time.h>
 #include <unistd.h>
 
-#include "daemon/listener.h"
-#include "daemon/web_http.h"
+#include "daemon/web_parts.h"
 
-#define PLAIN_MAX       32 /* connections beyond listen.clients that may be open: requests, and clients that are told to go */
-#define DOORSTEP_MAX    8  /* ... of the latter */
-#define ACCEPTS_MAX     16 /* in one turn */
-#define HEADER_S        10 /* for a request to come, and for an answer to go on */
-#define KEPT_S          15 /* an idle connection is kept open for another request */
-#define CLOSE_S         2  /* for a client that is told to go */
-#define SNAPSHOT_S      60 /* for a snapshot to be made */
-#define HEADERS_MAX     4096
-#define SETTLE_NS       10000000ll   /* after the handshake; see web_language.open */
-#define PONG_NS         2000000000ll /* the longest a client is waited for that was pinged */
-#define TICK_MS         1000         /* doors that were closed for want of descriptors */
-#define PROTOCOLS_MAX   16
-#define RX_BYTES        4096
-#define CERTIFICATE_MAX (256u << 10)
-#define EXPIRES_SOON_S  (14 * 86400)
+#define PLAIN_MAX    32 /* connections beyond listen.clients that may be open: requests, and clients that are told to go */
+#define DOORSTEP_MAX 8  /* ... of the latter */
+#define ACCEPTS_MAX  16 /* in one turn */
+#define KEPT_S       15 /* an idle connection is kept open for another request */
+#define CLOSE_S      2  /* for a client that is told to go */
+#define HEADERS_MAX  4096
+#define SETTLE_NS    10000000ll   /* after the handshake; see web_language.open */
+#define PONG_NS      2000000000ll /* the longest a client is waited for that was pinged */
+#define TICK_MS      1000         /* doors that were closed for want of descriptors */
+#define RX_BYTES     4096
 
-enum stage { STAGE_ARRIVED, STAGE_IDLE, STAGE_ANSWERED, STAGE_SPEAKS };
-
-struct web_connection {
-	struct web *web;
-	struct web_connection *next;
-	struct lws *wsi; /* NULL until it is libwebsockets' */
-	bool owned;      /* ... which ends it */
-	uint64_t id;
-	struct sockaddr_storage from;
-	char address[64];
-	enum stage stage;
-	int64_t since_ns; /* in this stage */
-	struct web_rights rights;
-	uint64_t sent;
-	/* A plain request. */
-	struct web_answer answer;
-	bool answering, told; /* told: its header is out */
-	size_t answer_at;
-	/* A language. */
-	const struct web_language *language;
-	void *state;
-	bool begun, begun_text; /* a message */
-	bool asked;             /* to be called when there is room */
-	int64_t settle_ns;
-	bool pings, pinged; /* it is to be pinged; it was, and has not answered */
-	struct buffer in;   /* a message that is coming */
-	bool in_text;
-	int close_code;
-	bool said_close;
-	char reason[WEB_REASON_MAX + 1];
-};
-
-struct speaker {
-	const struct web_language *language;
-	void *ctx;
-};
-
-struct web {
-	uv_loop_t *loop;
-	struct publisher *publisher;
-	struct web_host host;
-	struct web_site site;
-	struct listener listener;
-	char address[ADDRESS_TEXT_MAX + 16];
-	struct lws_context *context;
-	struct lws_vhost *vhost;
-	struct lws_protocols protocol[PROTOCOLS_MAX + 1];
-	struct speaker speaker[WEB_LANGUAGES_MAX];
-	int speakers;
-	int speaks[PROTOCOLS_MAX]; /* which of them, by protocol */
-	uv_poll_t door;
-	uv_timer_t timer, tick;
-	int64_t armed_ns; /* when `timer` comes; INT64_MAX: it does not */
-	bool open, polling, stopped;
-	struct web_connection *connections;
-	size_t count, clients; /* all; of those that speak */
-	uint64_t next_id;
-	struct web_connection *arriving; /* while it is handed over */
-	uint8_t out[LWS_PRE + WEB_PIECE_MAX];
-};
-
-static int64_t now(const struct web *web)
+int64_t web_now(const struct web *web)
 {
 	return web->host.server.now(web->host.server.ctx);
 }
 
-static void log_text(const struct web *web, int priority, const char *text)
+void web_log(const struct web *web, int priority, const char *text)
 {
 	web->host.server.log(web->host.server.ctx, priority, text);
 }
 
-static void enter(struct web_connection *c, enum stage stage)
+void web_enter(struct web_connection *c, enum web_stage stage)
 {
 	c->stage = stage;
-	c->since_ns = now(c->web);
+	c->since_ns = web_now(c->web);
 }
 
 /* Ends */
@@ -155,207 +86,6 @@ static void free_connection(struct web_connection *c)
 	free(c);
 }
 
-/* Plain answers */
-
-static bool put_header(struct lws *wsi, const char *name, const char *value, uint8_t **p, uint8_t *end)
-{
-	return lws_add_http_header_by_name(wsi, (const unsigned char *)name, (const unsigned char *)value,
-	                                   (int)strlen(value), p, end) == 0;
-}
-
-static bool put_optional_headers(struct lws *wsi, const struct web_answer *a, uint8_t **p, uint8_t *end)
-{
-	char text[80];
-	bool good = true;
-
-	if (a->type)
-		good &= put_header(wsi, "content-type:", a->type, p, end);
-	if (a->policy)
-		good &= put_header(wsi, "content-security-policy:", a->policy, p, end);
-	if (a->etag[0])
-		good &= put_header(wsi, "etag:", a->etag, p, end);
-	if (a->gzip)
-		good &= put_header(wsi, "content-encoding:", "gzip", p, end);
-	if (a->allow_origin)
-		good &= put_header(wsi, "access-control-allow-origin:", a->allow_origin, p, end);
-	if (a->allow_methods)
-		good &= put_header(wsi, "allow:", "GET, HEAD", p, end);
-	if (a->ask_token)
-		good &= put_header(wsi, "www-authenticate:", "Bearer", p, end);
-	if (a->file[0]) {
-		snprintf(text, sizeof(text), "attachment; filename=\"%s\"", a->file);
-		good &= put_header(wsi, "content-disposition:", text, p, end);
-	}
-	if (a->retry_after_s > 0) {
-		snprintf(text, sizeof(text), "%d", a->retry_after_s);
-		good &= put_header(wsi, "retry-after:", text, p, end);
-	}
-	return good;
-}
-
-/* False: it cannot be said. */
-static bool write_header(struct lws *wsi, const struct web_answer *a)
-{
-	uint8_t bytes[LWS_PRE + 2048], *start = bytes + LWS_PRE, *p = start, *end = bytes + sizeof(bytes);
-	bool good = lws_add_http_header_status(wsi, (unsigned)a->code, &p, end) == 0;
-
-	good &= put_header(wsi, "x-content-type-options:", "nosniff", &p, end);
-	good &= put_header(wsi, "referrer-policy:", "no-referrer", &p, end); /* an address may carry the token */
-	good &= put_header(wsi, "cache-control:", "no-cache", &p, end);      /* always ask; the etag saves the rest */
-	good &= put_header(wsi, "vary:", "Origin", &p, end);
-	good &= put_optional_headers(wsi, a, &p, end);
-	if (!(a->head && !a->bytes) && a->code != 304)
-		good &= lws_add_http_header_content_length(wsi, a->len, &p, end) == 0;
-	return good && lws_finalize_write_http_header(wsi, start, &p, end) == 0;
-}
-
-/* The whole of a short answer, now: the connection is closed behind it. */
-static void refuse(struct lws *wsi, struct web_answer *a)
-{
-	uint8_t bytes[LWS_PRE + 512];
-	const size_t n = a->len < 512 ? a->len : 512;
-
-	if (!write_header(wsi, a))
-		return;
-	memcpy(bytes + LWS_PRE, a->bytes, n);
-	lws_write(wsi, bytes + LWS_PRE, n, LWS_WRITE_HTTP_FINAL);
-}
-
-static int end_answer(struct web_connection *c)
-{
-	web_answer_finish(&c->answer);
-	c->answering = false;
-	enter(c, STAGE_IDLE);
-	return lws_http_transaction_completed(c->wsi) ? -1 : 0;
-}
-
-/* Goes on with an answer, as there is room. -1: the connection is to be closed. */
-static int write_answer(struct web_connection *c)
-{
-	struct web_answer *a = &c->answer;
-	size_t total = 0;
-
-	if (!c->answering || !web_answer_ready(a))
-		return 0;
-	if (!c->told && !write_header(c->wsi, a))
-		return -1;
-	c->told = true;
-	if (a->head || a->code == 304 || a->len == 0)
-		return end_answer(c);
-	lws_set_timeout(c->wsi, PENDING_TIMEOUT_HTTP_CONTENT, HEADER_S);
-	while (c->answer_at < a->len && total < WEB_TURN_BYTES && !lws_send_pipe_choked(c->wsi)) {
-		const size_t left = a->len - c->answer_at, n = left < WEB_PIECE_MAX ? left : WEB_PIECE_MAX;
-
-		memcpy(c->web->out + LWS_PRE, (const uint8_t *)a->bytes + c->answer_at, n);
-		if (lws_write(c->wsi, c->web->out + LWS_PRE, n, n == left ? LWS_WRITE_HTTP_FINAL : LWS_WRITE_HTTP) <
-		    (int)n)
-			return -1;
-		c->answer_at += n;
-		c->sent += n;
-		total += n;
-	}
-	if (c->answer_at == a->len)
-		return end_answer(c);
-	lws_callback_on_writable(c->wsi);
-	return 0;
-}
-
-/* Requests */
-
-/* The texts of a request, copied: libwebsockets' own go with the next one. */
-struct texts {
-	char host[300], origin[300], authorization[WEB_TOKEN_MAX + 16], token[WEB_TOKEN_MAX + 8], if_none_match[512];
-};
-
-/* NULL where it was not sent. One that is too long is not what we know, and is taken for an empty one. */
-static const char *take_header(struct lws *wsi, enum lws_token_indexes which, char *text, size_t cap)
-{
-	text[0] = '\0';
-	if (lws_hdr_total_length(wsi, which) == 0)
-		return NULL;
-	if (lws_hdr_copy(wsi, text, (int)cap, which) < 0)
-		text[0] = '\0';
-	return text;
-}
-
-static const char *take_token(struct lws *wsi, struct texts *texts)
-{
-	const char *value = lws_get_urlarg_by_name(wsi, "token=", texts->token, sizeof(texts->token));
-
-	return value && *value ? value : NULL;
-}
-
-static const char *method_of(struct lws *wsi)
-{
-	if (lws_hdr_total_length(wsi, WSI_TOKEN_GET_URI) > 0)
-		return "GET";
-	return lws_hdr_total_length(wsi, WSI_TOKEN_HEAD_URI) > 0 ? "HEAD" : "POST"; /* or another one that we refuse */
-}
-
-static void read_request(struct web_connection *c, const char *path, bool upgrade, struct texts *texts,
-                         struct web_request *ret)
-{
-	struct lws *wsi = c->wsi;
-
-	*ret = (struct web_request){.method = method_of(wsi), .path = path, .from = &c->from, .upgrade = upgrade};
-	ret->host = take_header(wsi, WSI_TOKEN_HOST, texts->host, sizeof(texts->host));
-	ret->origin = take_header(wsi, WSI_TOKEN_ORIGIN, texts->origin, sizeof(texts->origin));
-	ret->authorization =
-	    take_header(wsi, WSI_TOKEN_HTTP_AUTHORIZATION, texts->authorization, sizeof(texts->authorization));
-	ret->if_none_match =
-	    take_header(wsi, WSI_TOKEN_HTTP_IF_NONE_MATCH, texts->if_none_match, sizeof(texts->if_none_match));
-	ret->token = take_token(wsi, texts);
-}
-
-static bool admit(struct web_connection *c, const struct web_request *request)
-{
-	char line[160];
-	const bool admitted = web_site_admit(&c->web->site, request, &c->rights, &c->answer, line);
-
-	if (line[0])
-		log_text(c->web, LOG_WARNING, line);
-	return admitted;
-}
-
-static int on_request(struct web_connection *c, const char *path, size_t len)
-{
-	struct web_request request;
-	struct texts texts;
-	char name[256] = "/?"; /* a longer one is none of ours */
-
-	if (len < sizeof(name))
-		snprintf(name, sizeof(name), "%.*s", (int)len, path);
-	web_answer_finish(&c->answer);
-	enter(c, STAGE_ANSWERED);
-	c->answering = true;
-	c->told = false;
-	c->answer_at = 0;
-	read_request(c, name, false, &texts, &request);
-	if (admit(c, &request))
-		web_site_answer(&c->web->site, &request, &c->answer);
-	lws_set_timeout(c->wsi, PENDING_TIMEOUT_HTTP_CONTENT, c->answer.snapshot ? SNAPSHOT_S : HEADER_S);
-	if (web_answer_ready(&c->answer))
-		lws_callback_on_writable(c->wsi);
-	return 0;
-}
-
-/* 0: it may become a WebSocket; 1: refused, and told why; -1: just closed. */
-static int on_upgrade(struct web_connection *c, const char *to)
-{
-	struct web_request request;
-	struct texts texts;
-	bool admitted;
-
-	if (strcasecmp(to, "websocket") != 0)
-		return -1; /* HTTP/2 without TLS: nobody needs it */
-	read_request(c, "/", true, &texts, &request);
-	admitted = admit(c, &request);
-	if (!admitted)
-		refuse(c->wsi, &c->answer);
-	web_answer_finish(&c->answer);
-	return admitted ? 0 : 1;
-}
-
 /* Languages */
 
 static void arm(struct web_connection *c);
@@ -371,13 +101,13 @@ static void ask_for_room(struct web_connection *c)
 static int on_established(struct web_connection *c, const struct lws_protocols *protocol)
 {
 	struct web *web = c->web;
-	const struct speaker *speaker = &web->speaker[web->speaks[protocol->id]];
+	const struct web_speaker *speaker = &web->speaker[web->speaks[protocol->id]];
 
-	enter(c, STAGE_SPEAKS);
+	web_enter(c, STAGE_SPEAKS);
 	lws_set_timeout(c->wsi, NO_PENDING_TIMEOUT, 0);
 	c->language = speaker->language;
 	c->pings = c->language->ping_first;
-	c->settle_ns = now(web) + (c->pings ? PONG_NS : SETTLE_NS);
+	c->settle_ns = web_now(web) + (c->pings ? PONG_NS : SETTLE_NS);
 	if (++web->clients > (size_t)web->site.config->listen.clients + DOORSTEP_MAX)
 		return -1;
 	if (web->clients > (size_t)web->site.config->listen.clients) {
@@ -404,7 +134,7 @@ static int ping(struct web_connection *c)
 static int on_pong(struct web_connection *c)
 {
 	if (c->pinged && c->settle_ns)
-		c->settle_ns = now(c->web) + SETTLE_NS;
+		c->settle_ns = web_now(c->web) + SETTLE_NS;
 	c->pinged = false;
 	arm(c);
 	return 0;
@@ -457,7 +187,7 @@ static int say_piece(struct web_connection *c, int64_t t_ns)
 
 static int on_room(struct web_connection *c)
 {
-	const int64_t t_ns = now(c->web);
+	const int64_t t_ns = web_now(c->web);
 	size_t total = 0;
 	int n = 1;
 
@@ -556,11 +286,11 @@ static int on_lws(struct lws *wsi, enum lws_callback_reasons reason, void *user,
 		free_connection(c);
 		return 0;
 	case LWS_CALLBACK_HTTP:
-		return on_request(c, in, len);
+		return web_request(c, in, len);
 	case LWS_CALLBACK_HTTP_CONFIRM_UPGRADE:
-		return on_upgrade(c, in);
+		return web_upgrade(c, in);
 	case LWS_CALLBACK_HTTP_WRITEABLE:
-		return write_answer(c);
+		return web_write_answer(c);
 	case LWS_CALLBACK_ESTABLISHED:
 		return on_established(c, lws_get_protocol(wsi));
 	case LWS_CALLBACK_SERVER_WRITEABLE:
@@ -628,7 +358,7 @@ static void welcome(struct web *web, int fd, const struct sockaddr_storage *from
 	            NI_NUMERICHOST | NI_NUMERICSERV);
 	*c = (struct web_connection){.web = web, .from = *from, .id = ++web->next_id, .next = web->connections};
 	snprintf(c->address, sizeof(c->address), "ws:%.48s:%.6s", host, port);
-	enter(c, STAGE_ARRIVED);
+	web_enter(c, STAGE_ARRIVED);
 	web->connections = c;
 	web->count++;
 	adopt.opaque = c;
@@ -685,7 +415,7 @@ static int64_t deadline_of(const struct web_connection *c)
 static void on_timer(uv_timer_t *timer)
 {
 	struct web *web = timer->data;
-	const int64_t t_ns = now(web);
+	const int64_t t_ns = web_now(web);
 
 	web->armed_ns = INT64_MAX;
 	for (struct web_connection *c = web->connections; c; c = c->next) {
@@ -711,7 +441,7 @@ static void arm(struct web_connection *c)
 	if (web->stopped || deadline_ns >= web->armed_ns)
 		return;
 	web->armed_ns = deadline_ns;
-	wait_ns = deadline_ns - now(web);
+	wait_ns = deadline_ns - web_now(web);
 	uv_timer_start(&web->timer, on_timer, wait_ns <= 0 ? 1 : (uint64_t)((wait_ns + 999999) / 1000000), 0);
 }
 
@@ -826,55 +556,6 @@ void web_hold(struct web_connection *c, bool on)
 
 /* Life */
 
-/* A certificate that cannot be used is told before anybody tries. Empty: it is good; else a sentence. `ret_soon`: days until it
- * expires, if these are few, else -1. */
-static void judge_certificate(const struct config *config, int *ret_soon, char error[320])
-{
-	union lws_tls_cert_info_results info = {0};
-	struct lws_x509_cert *x509 = NULL;
-	const char *path = config->listen.certificate;
-	FILE *file = fopen(path, "re");
-	char *text = calloc(1, CERTIFICATE_MAX);
-	size_t n = file && text ? fread(text, 1, CERTIFICATE_MAX - 1, file) : 0;
-
-	*ret_soon = -1;
-	error[0] = '\0';
-	if (n == 0)
-		snprintf(error, 320, "listen.tls.certificate: %.120s cannot be read (%s)", path,
-		         file ? "it is empty" : strerror(errno));
-	else if (lws_x509_create(&x509) || lws_x509_parse_from_pem(x509, text, n + 1))
-		snprintf(error, 320, "listen.tls.certificate: %.120s is no certificate in PEM", path);
-	else if (lws_x509_info(x509, LWS_TLS_CERT_INFO_VALIDITY_TO, &info, 0) == 0 && info.time < time(NULL))
-		snprintf(error, 320, "listen.tls.certificate: %.120s has expired; renew it", path);
-	else if (info.time && info.time - time(NULL) < EXPIRES_SOON_S)
-		*ret_soon = (int)((info.time - time(NULL)) / 86400);
-	if (x509)
-		lws_x509_destroy(&x509);
-	if (file)
-		fclose(file);
-	free(text);
-}
-
-static bool check_tls(struct web *web, char error[320])
-{
-	const struct config *config = web->site.config;
-	char text[200];
-	int days;
-
-	if (!config->listen.has_tls)
-		return true;
-	if (access(config->listen.key, R_OK) < 0) {
-		snprintf(error, 320, "listen.tls.key: %.120s cannot be read (%s)", config->listen.key, strerror(errno));
-		return false;
-	}
-	judge_certificate(config, &days, error);
-	if (days >= 0) {
-		snprintf(text, sizeof(text), "listen.tls.certificate expires in %d days; renew it", days);
-		log_text(web, LOG_WARNING, text);
-	}
-	return error[0] == '\0';
-}
-
 struct web *web_create(uv_loop_t *loop, const struct config *config, struct publisher *publisher,
                        const struct web_host *host, int *ret_why, char error[320])
 {
@@ -899,7 +580,7 @@ struct web *web_create(uv_loop_t *loop, const struct config *config, struct publ
 	web->armed_ns = INT64_MAX;
 	if (config->listen.token_file[0])
 		r = web_token_read(config->listen.token_file, web->site.secret, error);
-	if (r == 0 && !check_tls(web, error))
+	if (r == 0 && !web_check_tls(web, error))
 		r = -EINVAL;
 	if (r == 0)
 		r = listener_open_http(&web->listener, config->listen.http, error);
@@ -918,7 +599,7 @@ void web_speak(struct web *web, const struct web_language *language, void *ctx)
 	if (!web)
 		return;
 	assert(web->speakers < WEB_LANGUAGES_MAX && !web->context);
-	web->speaker[web->speakers++] = (struct speaker){language, ctx};
+	web->speaker[web->speakers++] = (struct web_speaker){language, ctx};
 }
 
 /* Protocol 0 is plain HTTP, and what a client that names no subprotocol speaks: the first language. */

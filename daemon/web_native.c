@@ -206,6 +206,10 @@ static void do_command(struct speech *s, enum way way, const struct control_comm
 		    "commands that change something need the token of listen.token_file: open ws://.../?token=TOKEN");
 		return;
 	}
+	if (command->stream) {
+		say_error(s, way, "a recording is taken over the unix socket: facet record unix:PATH");
+		return;
+	}
 	if (control_changes(command->word)) {
 		if (!host->command(host->ctx, command, error)) {
 			say_error(s, way, error);

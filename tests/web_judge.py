@@ -319,6 +319,8 @@ def only_the_token_may_change_something(d):
         ws.say("?PAUSE")
         check(json.loads(ws.text()) == {"class": "OK", "command": "PAUSE"}, "?PAUSE with the token")
         check(d.status()["paused"], "it is paused")
+        ws.say('?RECORD={"stream":true}')
+        check("unix socket" in json.loads(ws.text())["error"], "a recording cannot be taken here, and none is begun or ended")
         ws.close()
 
 

@@ -14,10 +14,11 @@
  * The digest is one of all that extraction and border.c read, so equal digests mean equal surfaces and borders:
  *   - which cells have a surface: the patch's own and, for the border, those behind its faces. A border segment is drawn
  *     in a square whose corners differ; there `complete` and `has a surface` are the same;
- *   - which corners are the end of an edge that crosses the surface in one of these cells, and their signs. That is the
- *     sign of every corner of these cells: from one that is not such an end, edges of the cell lead over corners of
- *     the same sign to one that is, since a cell of one sign has no surface;
- *   - the values of these ends: a vertex reads no others. Edges of cells behind a face count only where they lie in it.
+ *   - which corners are the end of an edge that crosses the surface in one of these cells, for a cell behind a face only
+ *     of edges in that face;
+ *   - the values of these ends: a vertex reads no others. Their signs are those of all corners that are asked for: from one
+ *     that is no such end, edges of its cell (or square) lead over corners of the same sign to one that is, since
+ *     it has both signs.
  * What the fill read is not in it, only what it gave. */
 #include "core/cubes.h"
 
@@ -301,17 +302,17 @@ static void copy_values(const struct block *const *blocks, const struct rows *ro
 	window->digest = digest;
 }
 
-/* Cells, crossing edges' ends and their signs: 18 + 17 + 17 bits of a row, and its number. */
+/* Cells and ends of crossing edges: 18 + 17 bits of a row, and its number. */
 static struct digest digest_rows(const struct rows *rows)
 {
 	struct digest digest = {0, 0};
 	for (int k = -1; k <= PATCH_SIDE; k++)
 		for (int j = -1; j <= PATCH_SIDE; j++) {
 			int r = window_row(j, k);
-			uint64_t cells = rows->active[r], ends = rows->ends[r], inside = ends & rows->inside_after[r];
+			uint64_t cells = rows->active[r], ends = rows->ends[r];
 			if (cells | ends)
-				digest_word(&digest, (uint64_t)r << 52 | cells >> (WINDOW_LOW - 1) << 34 |
-				                         ends >> WINDOW_LOW << 17 | inside >> WINDOW_LOW);
+				digest_word(&digest,
+				            (uint64_t)r << 40 | cells >> (WINDOW_LOW - 1) << 20 | ends >> WINDOW_LOW);
 		}
 	return digest;
 }

@@ -16,7 +16,7 @@
 #include <string.h>
 
 #define ERROR_CLASSES 0x1fffffffu
-#define SECONDS_MAX   INT64_C(9000000000) /* until 2255: its nanoseconds have room */
+#define SECONDS_MAX   (CAN_WIRE_TIME_MAX / 1000000000 - 1) /* until 2043: what an entry may say */
 
 struct cursor {
 	const char *at, *end;
@@ -113,7 +113,7 @@ static bool time_of(struct cursor *c, int64_t *ret_ns)
 	if (!take(c, '(') || !number(c, 10, 19, &whole) || whole > (uint64_t)SECONDS_MAX)
 		return false;
 	s = (int64_t)whole;
-	if (take(c, '-') && !date(c, whole, &s))
+	if (take(c, '-') && (!date(c, whole, &s) || s > SECONDS_MAX))
 		return false;
 	if (!take(c, '.') || !(digits = number(c, 10, 9, &part)) || !take(c, ')'))
 		return false;

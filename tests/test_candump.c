@@ -126,7 +126,9 @@ static void a_line_that_is_not_candumps_is_refused(void **state)
 	    "can0 181",
 	    "can0 18#00",
 	    "can0 1810#00",
-	    "can0 800#00",                   /* more than 11 bits */
+	    "can0 800#00",                     /* more than 11 bits */
+	    "(2305843009.213694) can0 181#00", /* 2043: no entry can say it */
+	    "(2043-01-26 12:00:00.000000) can0 181#00",
 	    "can0 40000000#00",              /* more than 29 */
 	    "can0 181#0",                    /* half a byte */
 	    "can0 181#001122334455667788",   /* 9 bytes */

@@ -204,38 +204,42 @@ static struct reach reach_of(const struct fold_plane *plane, const double p[3])
 	return (struct reach){b, c, first, last, floor_int((first - crossing) * plane->n[0] * 65536 + 0.5)};
 }
 
-/* The block where the parts of a reach lie, up to voxel `k` of the column. */
-static struct scratch_block *reach_block(struct fold *fold, int axis, const struct reach *r, int32_t k)
+/* Inlined for each axis: what depends on it is then known to the compiler. */
+static inline __attribute__((always_inline)) void reach_add(struct fold *fold, const struct fold_plane *plane, int axis,
+                                                            const struct reach *r)
 {
-	const int32_t a = k >> BLOCK_SHIFT, b = r->b >> BLOCK_SHIFT, c = r->c >> BLOCK_SHIFT;
-
-	return scratch_make_room(fold, axis == 0 ? a : b, axis == 0 ? b : axis == 1 ? a : c, axis == 2 ? a : c);
-}
-
-static void reach_add(struct fold *fold, const struct fold_plane *plane, const struct reach *r)
-{
-	const int32_t in = BLOCK_SIDE - 1;
+	const int32_t in = BLOCK_SIDE - 1, b = r->b >> BLOCK_SHIFT, c = r->c >> BLOCK_SHIFT;
 	const int number = (r->c & in) * BLOCK_SIDE + (r->b & in);
 	int32_t k = r->first & ~in, first = r->first & in, d = r->d - first * plane->step;
 
 	for (; k <= r->last; k += BLOCK_SIDE, first = 0, d += plane->step * BLOCK_SIDE) {
-		struct scratch_block *block = reach_block(fold, plane->axis, r, k);
+		const int32_t a = k >> BLOCK_SHIFT;
+		struct scratch_block *block = scratch_make_room(fold, axis == 0 ? a : b,
+		                                                axis == 0   ? b
+		                                                : axis == 1 ? a
+		                                                            : c,
+		                                                axis == 2 ? a : c);
 
 		if (block && columns_reserve(fold))
-			column_add(column_of(fold, block, plane->axis, number)->at, plane, d, first,
+			column_add(column_of(fold, block, axis, number)->at, plane, d, first,
 			           r->last - k < in ? r->last - k : in);
 	}
 }
 
 static void reaches_add(struct fold *fold, const struct fold_plane *plane, const struct reach *reach, int n)
 {
-	for (int i = 0; i < n; i++) {
+	fold->stats.samples += (uint64_t)n;
+	for (; n > 0; n--, reach++) {
 		if (fold->samples == FOLD_SAMPLES_MAX)
 			fold_apply(fold);
-		reach_add(fold, plane, &reach[i]);
 		fold->samples++;
+		if (plane->axis == 0)
+			reach_add(fold, plane, 0, reach);
+		else if (plane->axis == 1)
+			reach_add(fold, plane, 1, reach);
+		else
+			reach_add(fold, plane, 2, reach);
 	}
-	fold->stats.samples += (uint64_t)n;
 }
 
 void fold_sample(struct fold *fold, const struct fold_plane *plane, struct vec3 point)
@@ -327,11 +331,11 @@ static int published_mean(const struct voxel *v)
  * VOXEL_UNKNOWN is far from every mean. On the far side a mean that touches would be published as 0. */
 static bool is_no_news(const struct voxel *v)
 {
-	int32_t weight = v->weight, apart = v->sum - v->published * weight;
-	int32_t most = (PUBLISH_STEP - 1) * weight, touching = -(TOUCHING - TOUCHING_STICKS + 1) * weight;
+	const int32_t weight = v->weight, apart = v->sum - v->published * weight, most = (PUBLISH_STEP - 1) * weight;
+	const int32_t touching = -(TOUCHING - TOUCHING_STICKS + 1) * weight;
 
-	return (weight >= WEIGHT_KNOWN) & (apart <= most) & (apart >= -most) &
-	       ((v->published >= 0) | (v->sum <= touching));
+	return ((uint32_t)(apart + most) <= (uint32_t)(2 * most)) & ((v->published >= 0) | (v->sum <= touching)) &
+	       (weight >= WEIGHT_KNOWN);
 }
 
 /* What is to be published of a voxel: the old value where there is no news. */
@@ -339,8 +343,6 @@ static int16_t published_after(const struct voxel *v)
 {
 	int mean;
 
-	if (is_no_news(v))
-		return v->published;
 	if (v->weight < WEIGHT_KNOWN)
 		return VOXEL_UNKNOWN;
 	mean = published_mean(v);
@@ -369,14 +371,19 @@ static int number_of(int axis, int voxel, int *ret_place)
 	return (axis == 2 ? y : z) * BLOCK_SIDE + (axis == 0 ? y : x);
 }
 
-/* What a voxel is after it got its share. */
-static inline void voxel_settle(struct fold *fold, struct block *block, int i, uint64_t changed[BLOCK_SIDE])
+/* What a voxel is after it got its share; `before` is what its sum was. Most get no news. */
+static inline void voxel_settle(struct fold *fold, struct block *block, int i, int32_t before,
+                                uint64_t changed[BLOCK_SIDE])
 {
 	const struct voxel *v = &block->voxel[i];
-	const uint64_t bit = UINT64_C(1) << (i & 63), negative = (uint64_t)(v->sum < 0) << (i & 63);
-	const int16_t value = published_after(v);
+	const uint64_t bit = UINT64_C(1) << (i & 63);
+	int16_t value;
 
-	block->negative[i >> 6] = (block->negative[i >> 6] & ~bit) | negative;
+	if ((before ^ v->sum) < 0)
+		block->negative[i >> 6] ^= bit;
+	if (is_no_news(v))
+		return;
+	value = published_after(v);
 	if (value == v->published)
 		return;
 	block_publish(block, i, value);
@@ -422,8 +429,10 @@ static void passed_fold(struct fold *fold, struct block *block, struct scratch_b
 			int voxel = z * 64 + __builtin_ctzll(bits), place, number = number_of(axis, voxel, &place);
 
 			if (!(from->seen[axis] >> number & 1) || !from->column[axis][number]->at[place]) {
+				int32_t before = block->voxel[voxel].sum;
+
 				voxel_clear(&block->voxel[voxel], from->rays[voxel]);
-				voxel_settle(fold, block, voxel, changed);
+				voxel_settle(fold, block, voxel, before, changed);
 			}
 			from->rays[voxel] = 0;
 		}
@@ -467,8 +476,11 @@ static void columns_fold(struct fold *fold, struct block *block, struct scratch_
 		__builtin_prefetch(&block->voxel[share[i].voxel], 1);
 	for (int i = 0; i < n; i++) {
 		__builtin_prefetch(&block->voxel[share[i + ahead < n ? i + ahead : i].voxel], 1);
-		voxel_add(&block->voxel[share[i].voxel], share[i].sum);
-		voxel_settle(fold, block, (int)share[i].voxel, changed);
+		struct voxel *v = &block->voxel[share[i].voxel];
+		int32_t before = v->sum;
+
+		voxel_add(v, share[i].sum);
+		voxel_settle(fold, block, (int)share[i].voxel, before, changed);
 	}
 }
 

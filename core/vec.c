@@ -9,19 +9,6 @@ struct transform transform_identity(void)
 	return (struct transform){.r = {1, 0, 0, 0, 1, 0, 0, 0, 1}};
 }
 
-struct vec3 transform_direction(const struct transform *a, struct vec3 d)
-{
-	const double *r = a->r;
-
-	return (struct vec3){r[0] * d.x + r[1] * d.y + r[2] * d.z, r[3] * d.x + r[4] * d.y + r[5] * d.z,
-	                     r[6] * d.x + r[7] * d.y + r[8] * d.z};
-}
-
-struct vec3 transform_point(const struct transform *a, struct vec3 p)
-{
-	return vec3_add(transform_direction(a, p), a->t);
-}
-
 struct transform transform_compose(const struct transform *a, const struct transform *b)
 {
 	struct transform c = {.t = transform_point(a, b->t)};

@@ -58,8 +58,19 @@ struct transform transform_identity(void);
 /* first b, then a: (a <- b) of (b <- c) gives (a <- c). */
 struct transform transform_compose(const struct transform *a, const struct transform *b);
 struct transform transform_inverse(const struct transform *a);
-struct vec3 transform_point(const struct transform *a, struct vec3 p);
-struct vec3 transform_direction(const struct transform *a, struct vec3 d);
+
+static inline struct vec3 transform_direction(const struct transform *a, struct vec3 d)
+{
+	const double *r = a->r;
+
+	return (struct vec3){r[0] * d.x + r[1] * d.y + r[2] * d.z, r[3] * d.x + r[4] * d.y + r[5] * d.z,
+	                     r[6] * d.x + r[7] * d.y + r[8] * d.z};
+}
+
+static inline struct vec3 transform_point(const struct transform *a, struct vec3 p)
+{
+	return vec3_add(transform_direction(a, p), a->t);
+}
 
 /* Roll, pitch, yaw in radians about the fixed axes x, y, z (REP-103): R = Rz Ry Rx. */
 struct transform transform_rpy(struct vec3 xyz_m, struct vec3 rpy_rad);

@@ -10,53 +10,17 @@
  * Nothing here looks at a clock. What changes the map hangs on records and ticks alone, so a kept list of them gives
  * the same rows again (law L7); the only thing a replay must be told besides is which rows the sink had refused. That
  * is why a refused row keeps its number. The second after which the look-ahead is folded is one without a row that was
- * taken, so that a map which takes no more of them (a pause) is complete a second later and then stands. A list that begins in mid-session begins with a snapshot (pipeline_state). */
+ * taken, so that a map which takes no more of them (a pause) is complete a second later and then stands. A list that begins in
+ * mid-session begins with a snapshot (pipeline_state.c). */
 #include "daemon/pipeline.h"
 
 #include <assert.h>
-#include <stdio.h>
 #include <stdlib.h>
 #include <string.h>
 
-#define IDLE_NS  1000000000ll /* recorded time without a row after which nothing waits for its look-ahead any more */
-#define ARRIVALS 64           /* profiles whose arrival is remembered: as many as an assembler lets wait */
+#include "daemon/pipeline_parts.h"
 
-struct device {
-	const struct driver *driver;
-	struct decoder *decoder;
-};
-
-struct scanner {
-	int device, tilt_device; /* the latter -1: fixed */
-	struct sweep *sweep;
-	struct {
-		int64_t t_ns, log_ns;
-	} arrival[ARRIVALS]; /* ring: first beam -> log time of the last byte */
-	unsigned arrivals;
-	bool begins; /* the row that began a sweep was not applied: the next one does */
-};
-
-struct pipeline {
-	const struct config *config;
-	struct pipeline_sink sink;
-	struct pose_track *track;
-	struct {
-		bool seen;
-		int device;
-		struct pose_jump jump;
-	} jump; /* in the record being handled: the last one of it */
-	struct device device[CONFIG_DEVICES_MAX];
-	struct scanner scanner[CONFIG_DEVICES_MAX];
-	int scanners;
-	int64_t log_ns;     /* of the record or tick being handled */
-	int64_t arrival_ns; /* of the row being handed out */
-	int64_t last_row_ns;
-	bool rows_since_flush;
-	uint64_t next_number;
-	uint64_t *skip; /* ascending */
-	size_t skips, skips_cap;
-	uint64_t rows, not_applied;
-};
+#define IDLE_NS 1000000000ll /* recorded time without a row after which nothing waits for its look-ahead any more */
 
 /* What decoders find */
 
@@ -310,119 +274,6 @@ void pipeline_reset(struct pipeline *p)
 int64_t pipeline_arrival_ns(const struct pipeline *p)
 {
 	return p->arrival_ns;
-}
-
-/* Snapshot */
-
-#define LOAD_REFUSED "the snapshot is damaged, or of another version of facetd"
-
-/* The list of devices is part of it: bytes of one are nothing to another. */
-static void device_state(struct state *s, const struct config_device *device, char error[160])
-{
-	char name[CONFIG_NAME_MAX] = "", driver[CONFIG_NAME_MAX] = "";
-
-	snprintf(name, sizeof(name), "%s", device->name);
-	snprintf(driver, sizeof(driver), "%s", device->driver);
-	state_bytes(s, name, sizeof(name));
-	state_bytes(s, driver, sizeof(driver));
-	if (s->failed || (strcmp(name, device->name) == 0 && strcmp(driver, device->driver) == 0))
-		return;
-	s->failed = true;
-	snprintf(error, 160, "kept with a device `%.31s` (%.31s) where the configuration has `%s` (%s)", name, driver,
-	         device->name, device->driver);
-}
-
-static void devices_state(struct state *s, const struct config *config, char error[160])
-{
-	int devices = config->devices;
-
-	state_int(s, &devices, 0, CONFIG_DEVICES_MAX);
-	if (!s->failed && devices != config->devices) {
-		s->failed = true;
-		snprintf(error, 160, "kept with %d devices, the configuration has %d", devices, config->devices);
-	}
-	for (int i = 0; i < config->devices && !s->failed; i++)
-		device_state(s, &config->device[i], error);
-}
-
-/* Oldest first. */
-static void scanner_state(struct state *s, struct scanner *scanner)
-{
-	const unsigned end = scanner->arrivals;
-	size_t known = end < ARRIVALS ? end : ARRIVALS;
-
-	state_tag(s, "scanner1");
-	state_bool(s, &scanner->begins);
-	state_size(s, &known, ARRIVALS);
-	for (size_t i = 0; i < known && !s->failed; i++) {
-		const size_t at = s->loading ? i : (end - known + i) % ARRIVALS;
-
-		state_time(s, &scanner->arrival[at].t_ns);
-		state_time(s, &scanner->arrival[at].log_ns);
-	}
-	if (s->loading)
-		scanner->arrivals = (unsigned)known;
-	sweep_state(s, scanner->sweep);
-}
-
-static void numbers_state(struct state *s, struct pipeline *p)
-{
-	state_tag(s, "numbers1");
-	state_time(s, &p->log_ns);
-	state_time(s, &p->arrival_ns);
-	state_time(s, &p->last_row_ns);
-	state_bool(s, &p->rows_since_flush);
-	state_u64(s, &p->next_number);
-	state_u64(s, &p->rows);
-	state_u64(s, &p->not_applied);
-}
-
-static void parts_state(struct state *s, struct pipeline *p)
-{
-	for (int i = 0; i < p->config->devices; i++) {
-		bool remembers = p->device[i].driver->state != NULL;
-		const bool can = remembers;
-
-		state_bool(s, &remembers);
-		s->failed |= remembers != can;
-		if (can)
-			p->device[i].driver->state(p->device[i].decoder, s);
-	}
-	pose_track_state(s, p->track);
-	for (int i = 0; i < p->scanners; i++)
-		scanner_state(s, &p->scanner[i]);
-	numbers_state(s, p);
-}
-
-/* Every part that refuses a load is as new afterwards, so the parts that took theirs are made to refuse one. */
-static void forget(struct pipeline *p)
-{
-	struct state nothing;
-
-	state_load(&nothing, NULL, 0);
-	parts_state(&nothing, p);
-	for (int i = 0; i < p->scanners; i++) {
-		p->scanner[i].arrivals = 0;
-		p->scanner[i].begins = false;
-	}
-	p->log_ns = p->arrival_ns = p->last_row_ns = 0;
-	p->rows_since_flush = false;
-	p->next_number = p->rows = p->not_applied = 0;
-}
-
-void pipeline_state(struct pipeline *p, struct state *s, char error[160])
-{
-	snprintf(error, 160, "%s", LOAD_REFUSED);
-	state_tag(s, "pipeline2");
-	devices_state(s, p->config, error);
-	if (!s->failed)
-		parts_state(s, p);
-	if (s->loading && !state_done(s))
-		s->failed = true;
-	if (s->failed)
-		forget(p);
-	else
-		*error = 0;
 }
 
 /* Life */

@@ -38,8 +38,8 @@ struct server *server_create(uv_loop_t *, const struct config *, struct publishe
 void server_stop(struct server *);
 void server_destroy(struct server *);
 
-void server_wake(struct server *);                                /* the publisher has news */
-void server_streams(struct server *);                             /* recordings have bytes for who takes them */
+void server_wake(struct server *);    /* the publisher has news */
+void server_streams(struct server *); /* recordings have bytes for who takes them */
 /* The daemon ends: recordings that clients take are to end in order. How many of them are not written out yet. */
 size_t server_end_streams(struct server *);
 void server_event(struct server *, const char *text, size_t len); /* one JSON text, to all who watch */

@@ -104,7 +104,9 @@ static int open_socket(struct recording *r)
 	socklen_t len;
 
 	if (address_parse(text, ADDRESS_UNIX, &address, sentence) < 0)
-		return fail(r, text, "a recording is taken over a unix socket: unix:PATH; from elsewhere: ssh HOST facet record");
+		return fail(
+		    r, text,
+		    "a recording is taken over a unix socket: unix:PATH; from elsewhere: ssh HOST facet record");
 	address_sockaddr(&address, &to, &len);
 	r->socket = socket(AF_UNIX, SOCK_STREAM | SOCK_CLOEXEC, 0);
 	if (r->socket >= 0 && connect(r->socket, (struct sockaddr *)&to, len) == 0)

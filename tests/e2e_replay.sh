@@ -1,7 +1,8 @@
 #!/bin/sh
 # Laws L7, L2: a drive, live and replayed in every way there is, is one map: kept journal and recording, all files of a rotation in
 # any order, any batches, threads and speeds, another compiler without optimisation, through facet and through facetd, after
-# seeking there and back, and taken apart into what people have (a capture, a candump log, a list of poses).
+# seeking there and back, at its own pace, half and a tenth of it, and taken apart into what people have (captures, a candump log, a
+# list of poses). A CARMEN log and a folder of scans give what is in them.
 . "$(dirname "$0")/lib.sh"
 address=unix:$scratch/sim/facetd.sock
 
@@ -56,11 +57,20 @@ same "both journals" --config "$scratch/live.yaml" "$scratch/journal" "$scratch/
 same "a batch per row" --batch row "$@"
 same "a batch a second, two threads" --batch second --threads 2 "$@"
 same "20 times as fast" --speed 20 "$@"
-# A file alone begins in mid-drive with its snapshot and an empty map; the same one each time.
-for last; do :; done
-wanted=$(hash_of "$last")
-[ -n "$wanted" ] && [ "$wanted" != none ] || fail "the last file alone"
-same "the last file alone, once more" --batch row "$last"
+# A file alone begins in mid-drive with its snapshot and an empty map; the same one each time, whatever the pace.
+alone=$(ls -S "$@" | head -n 1)
+wanted=$(hash_of "$alone")
+cp "$scratch/out.ply" "$scratch/alone.ply"
+[ -n "$wanted" ] && [ "$wanted" != none ] || fail "a file alone"
+same "a file alone, once more" --batch row "$alone"
+for file; do
+    [ "$(hash_of "$file")" != none ] || fail "$file alone"
+done
+for speed in 0.5 1; do # these take their time, so they have it from here on
+    sed "s|$scratch/sim/facetd.sock|$scratch/pace$speed.sock|" "$scratch/live.yaml" >"$scratch/pace$speed.yaml"
+    "$facetd" --config "$scratch/pace$speed.yaml" --speed $speed --replay "$alone" >"$scratch/pace$speed.log" 2>&1 &
+    eval "pace_${speed#*.}=$!"
+done
 wanted=$(hash_of "$@")
 
 if command -v clang >/dev/null; then
@@ -104,6 +114,52 @@ for speed in max 30; do
     wait "$daemon" || fail "the daemon ended badly: $(tail -3 "$scratch/replay.log")"
 done
 
+# At a tenth: it is slow indeed, stands while it is paused, is sought in both ways and ends at once when it is told to.
+paced() { # SPEED PROCESS: at its end
+    until_holds "s['replay']['state'] == 'ended'"
+    "$facet" save "$address" -o "$scratch/paced.ply" >/dev/null || fail "--speed $1: not saved"
+    cmp -s "$scratch/paced.ply" "$scratch/alone.ply" || fail "--speed $1: another map"
+    ends "$2" || fail "--speed $1: the daemon ended badly: $(tail -3 "$scratch/pace$1.log")"
+}
+
+seek() { # WHAT, e.g. "t": 17
+    say "?SEEK={$1}" | grep -q '"OK"' || fail "?SEEK={$1} was refused"
+}
+
+place() { # SHARE of the recording
+    status "s['replay']['begin'] + $1 * (s['replay']['end'] - s['replay']['begin'])"
+}
+
+# shellcheck disable=SC2154
+{
+    address=unix:$scratch/pace0.5.sock
+    paced 0.5 "$pace_5"
+    address=unix:$scratch/pace1.sock
+    seek "\"t\": $(place 0.3)"
+    until_holds "s['replay']['state'] in ('playing', 'ended')"
+    seek "\"t\": $(place 0.7)"
+    paced 1 "$pace_1"
+}
+sed "s|$scratch/sim/facetd.sock|$scratch/slow.sock|" "$scratch/live.yaml" >"$scratch/pace0.1.yaml"
+address=unix:$scratch/slow.sock
+began=$(date +%s.%N)
+"$facetd" --config "$scratch/pace0.1.yaml" --speed 0.1 --replay "$alone" >"$scratch/pace0.1.log" 2>&1 &
+slow=$!
+until_holds "s['replay']['state'] == 'playing' and s['replay']['position'] > s['replay']['begin']"
+ran=$(status "s['replay']['position'] - s['replay']['begin']")
+awk -v ran="$ran" -v began="$began" -v now="$(date +%s.%N)" 'BEGIN { exit !(ran <= 0.1 * (now - began) + 0.02) }' || fail "--speed 0.1: $ran s are played already"
+say '?PAUSE' >/dev/null
+until_holds "s['replay']['state'] == 'paused'"
+stood=$(status "s['replay']['position']")
+sleep 0.5
+[ "$(status "s['replay']['position']")" = "$stood" ] || fail "--speed 0.1: it goes on while it is paused"
+seek "\"t\": $(place 0.6)"
+seek "\"t\": $(place 0.2)"
+say '?RESUME' >/dev/null
+until_holds "s['replay']['state'] == 'playing'"
+seek '"speed": "max"'
+paced 0.1 $slow
+
 # In parts: the list before the reset, and what can be made of it. When the loop read a frame, a candump log does not tell: the
 # list is put into the order of the parts, and rows wait long enough for all orders to be the same to them.
 (cat "$scratch/live.yaml" && echo 'map: {hold: 1s}') >"$scratch/held.yaml"
@@ -111,6 +167,7 @@ scanner=$(sed -n 's/.*driver: tim, connect: "\([^"]*\)".*/\1/p' "$scratch/live.y
 python3 tests/journal_parts.py "$scratch/journal" "$scratch/part" 0 1 2 "$scanner" || fail "the journal was not taken apart"
 wanted=$(hash_of --config "$scratch/held.yaml" "$scratch/part.ended")
 same "a capture, a candump log and poses" --config "$scratch/held.yaml" "$scratch/part.pcap" "$scratch/part.log" "$scratch/part.jsonl"
+same "the capture as pcapng" --config "$scratch/held.yaml" "$scratch/part.pcapng" "$scratch/part.log" "$scratch/part.jsonl"
 same "these in another order" --config "$scratch/held.yaml" "$scratch/part.jsonl" "$scratch/part.pcap" "$scratch/part.log"
 
 # Refusals name the file and what to do.
@@ -129,6 +186,12 @@ refused 'cannot be replayed together' --config "$scratch/live.yaml" "$scratch/pa
 sed 's/connect: unix:[^,}]*/connect: can7/' "$scratch/live.yaml" | sed 's/connect: "unix:[^"]*"/connect: can7/' >"$scratch/other.yaml"
 refused 'no device of the configuration is on can0' --config "$scratch/other.yaml" "$scratch/part.log"
 refused 'cannot be read' "$scratch/nothing"
+
+# A CARMEN log with a tilt channel is the room that it was made of.
+printf 'map: {hold: 1s}\ndevices:\n  - {name: laser, driver: carmen, tilt: laser}\n  - {name: pose, driver: pose, listen: "unix:/nowhere"}\n' >"$scratch/room.yaml"
+python3 tests/carmen_room.py write "$scratch/room.log"
+[ "$(hash_of --config "$scratch/room.yaml" --ascii "$scratch/room.log")" != none ] || fail "a CARMEN log is not replayed"
+python3 tests/carmen_room.py judge "$scratch/out.ply" || fail "a CARMEN log is not the room that it was made of"
 
 if [ -d ../shared/data/kurt3d ]; then
     "$facet" reconstruct -o "$scratch/k.ply" ../shared/data/kurt3d/scan00?.3d >/dev/null

@@ -2,8 +2,8 @@
 """Takes a list kept by `facetd --journal` apart into what people have: a capture of the scanner's TCP (pcap), a candump log, poses as
 JSON lines. Segments are cut, swapped and repeated as networks do it, so that reading them back is no matter of course.
 
-    journal_parts.py JOURNAL OUT LASER SERVO POSE     the places of the devices in the configuration; writes OUT.pcap, .log, .jsonl,
-    and OUT.ended, the list as these tell it
+    journal_parts.py JOURNAL OUT LASER SERVO POSE     the places of the devices in the configuration; writes OUT.pcap, .pcapng, .log,
+    .jsonl, and OUT.ended, the list as these tell it, with the ticks that a replay of them makes up
 """
 import json
 import struct
@@ -30,6 +30,33 @@ def packet(source, target, sequence, flags, payload):
     return b"\0" * 12 + b"\x08\x00" + head + tcp
 
 
+def block(kind, body):
+    """Of a pcapng file."""
+    body += b"\0" * (-len(body) % 4)
+    return struct.pack("<II", kind, len(body) + 12) + body + struct.pack("<I", len(body) + 12)
+
+
+def pcapng(packets):
+    """One section, one interface with times in ns, a packet a block."""
+    ret = block(0x0A0D0D0A, struct.pack("<IHHq", 0x1A2B3C4D, 1, 0, -1))
+    ret += block(1, struct.pack("<HHIHHBxxxHH", 1, 0, 65535, 9, 1, 9, 0, 0))
+    for t_ns, data in packets:
+        ret += block(6, struct.pack("<IIIII", 0, t_ns >> 32, t_ns & 0xffffffff, len(data), len(data)) + data)
+    return ret
+
+
+def ticks(times):
+    """Ten a second, before what is of the same time; where nothing comes for long, at its beginning only."""
+    now, tick = times[0], times[0] + 10**8
+    for t_ns in times:
+        while tick <= t_ns:
+            yield tick
+            tick += 10**8
+            if t_ns - tick > 3 * 10**9 and tick - now > 3 * 10**9:
+                tick = t_ns
+        now = t_ns
+
+
 def main():
     path, out = sys.argv[1:3]
     laser, servo, pose = map(int, sys.argv[3:6])
@@ -45,6 +72,8 @@ def main():
         if device == laser:
             merged.append((t_ns, 0, device, direction, payload))
         if device == laser and direction == 2:
+            if client:  # else a second program's words to the scanner, which are not followed before the first is silent
+                packets.append((t_ns, packet(client, server, sequence[1], 17, b"")))
             client = ((10, 0, 0, 1), 40000 + said)
             said += 1
             sequence = [0xfffffff0, 77]  # wraps
@@ -76,16 +105,21 @@ def main():
         f.write(struct.pack("<IHHiIII", 0xa1b23c4d, 2, 4, 0, 0, 65535, 1))
         for t_ns, data in packets:
             f.write(struct.pack("<IIII", t_ns // 10**9, t_ns % 10**9, len(data), len(data)) + data)
+    with open(out + ".pcapng", "wb") as f:
+        f.write(pcapng(packets))
     # The same records in the order of these files, and five quiet seconds: what waits is handed out.
     merged.sort(key=lambda r: (r[0], r[1]))
     with open(path, "rb") as f, open(out + ".ended", "wb") as g:
         head = f.read(13)
         g.write(head + f.read(struct.unpack_from("<I", head, 9)[0]))
+        due = list(ticks([r[0] for r in merged]))[::-1]
         for t_ns, _, device, direction, payload in merged:
+            while due and due[-1] <= t_ns:
+                g.write(struct.pack("<Bq", 3, due.pop()))
             g.write(struct.pack("<BqqBBI", 2, t_ns, t_ns, device, direction, len(payload)) + payload)
         g.write(struct.pack("<Bq", 3, merged[-1][0] + 5 * 10**9))
     with open(out + ".log", "w", encoding="ascii") as f:
-        f.writelines(line + "\n" for _, line in sorted(log))
+        f.writelines(line + "\n" for _, line in sorted(log, key=lambda entry: entry[0]))  # equal times stay in their order
     with open(out + ".jsonl", "w", encoding="ascii") as f:
         f.writelines(line + "\n" for line in poses)
 

@@ -1,9 +1,9 @@
 /* The distance of a point to a triangle: to its plane where the foot lies inside, else to the nearest edge. The foot is
  * judged by barycentric coordinates, whose divisor is made once per triangle.
  *
- * Of several triangles the one with the least lower bound is looked at first; hardly another one then has a bound that
- * asks for its distance. Bounds round, by far less than BOUND_SLACK, which is taken off them: the answer is that of all
- * the distances. */
+ * Of a fan the triangle with the least lower bound is looked at first; hardly another one then has a bound that asks for
+ * its distance. Bounds round, by far less than BOUND_SLACK, which is taken off them: the answer is that of all the
+ * distances. */
 #include "core/distance.h"
 
 #define BOUND_SLACK 0.001 /* squared lattice units; triangles with an altitude of a lattice unit round by 1e-4 */
@@ -37,7 +37,7 @@ double segment_distance_squared(struct vec3 a, struct vec3 b, struct vec3 p)
 	return to_segment(a, along, vec3_dot(along, along), p);
 }
 
-double flat_distance_squared(const struct flat *f, struct vec3 p)
+static inline double to_flat(const struct flat *f, struct vec3 p)
 {
 	struct vec3 d = vec3_sub(p, f->a);
 	double db = vec3_dot(d, f->ab), dc = vec3_dot(d, f->ac);
@@ -61,51 +61,116 @@ double flat_distance_squared(const struct flat *f, struct vec3 p)
 	return best;
 }
 
-void fan_close(struct fan *fan)
+double flat_distance_squared(const struct flat *f, struct vec3 p)
 {
-	for (uint32_t k = 0; k < fan->n; k++) {
-		struct flat *f = &fan->flat[k];
-		f->normal = vec3_scale(f->normal, 1 / vec3_norm(f->normal));
-		f->determinant = f->ab_ab * f->ac_ac - f->ab_ac * f->ab_ac;
-		double bc_bc = f->ab_ab + f->ac_ac - 2 * f->ab_ac;
-		double share = 1 / (f->determinant * f->ab_ab * f->ac_ac * bc_bc);
-		fan->share[k][0] = share * f->ab_ab * bc_bc;
-		fan->share[k][1] = share * f->ac_ac * bc_bc;
-		fan->share[k][2] = share * f->ab_ab * f->ac_ac;
+	return to_flat(f, p);
+}
+
+static inline struct flat flat_of(const struct fan *fan, uint32_t k)
+{
+	return (struct flat){fan->a,
+	                     {fan->ab[0][k], fan->ab[1][k], fan->ab[2][k]},
+	                     {fan->ac[0][k], fan->ac[1][k], fan->ac[2][k]},
+	                     {fan->normal[0][k], fan->normal[1][k], fan->normal[2][k]},
+	                     fan->ab_ab[k],
+	                     fan->ab_ac[k],
+	                     fan->ac_ac[k],
+	                     fan->determinant[k]};
+}
+
+/* Loops over a fan run over pairs: so they are done two at a time, without a rest. */
+static uint32_t pairs(const struct fan *fan)
+{
+	return (fan->n + 1) & ~1u;
+}
+
+void fan_span(struct fan *fan)
+{
+	if (fan->n & 1)
+		for (int axis = 0; axis < 3; axis++) {
+			fan->ab[axis][fan->n] = fan->ab[axis][fan->n - 1];
+			fan->ac[axis][fan->n] = fan->ac[axis][fan->n - 1];
+		}
+	for (uint32_t k = 0, n = pairs(fan); k < n; k++) {
+		double bx = fan->ab[0][k], by = fan->ab[1][k], bz = fan->ab[2][k];
+		double cx = fan->ac[0][k], cy = fan->ac[1][k], cz = fan->ac[2][k];
+		fan->normal[0][k] = by * cz - bz * cy;
+		fan->normal[1][k] = bz * cx - bx * cz;
+		fan->normal[2][k] = bx * cy - by * cx;
+		fan->ab_ab[k] = bx * bx + by * by + bz * bz;
+		fan->ab_ac[k] = bx * cx + by * cy + bz * cz;
+		fan->ac_ac[k] = cx * cx + cy * cy + cz * cz;
+		fan->bc_bc[k] = fan->ab_ab[k] + fan->ac_ac[k] - 2 * fan->ab_ac[k];
 	}
 }
 
-static double beyond(double coordinate, double share)
+void fan_close(struct fan *fan)
 {
-	double outside = coordinate < 0 ? coordinate : 0;
-	return outside * outside * share;
+	for (uint32_t k = 0, n = pairs(fan); k < n; k++) {
+		double x = fan->normal[0][k], y = fan->normal[1][k], z = fan->normal[2][k];
+		double unit = 1 / sqrt(x * x + y * y + z * z);
+		double bb = fan->ab_ab[k], cc = fan->ac_ac[k], third = fan->bc_bc[k];
+		double determinant = bb * cc - fan->ab_ac[k] * fan->ab_ac[k];
+		double share = 0.25 / (determinant * bb * cc * third);
+		fan->normal[0][k] = x * unit;
+		fan->normal[1][k] = y * unit;
+		fan->normal[2][k] = z * unit;
+		fan->determinant[k] = determinant;
+		fan->share[0][k] = share * bb * third;
+		fan->share[1][k] = share * cc * third;
+		fan->share[2][k] = share * bb * cc;
+	}
 }
 
-/* The squared height, plus how far p lies beyond the side it is farthest outside of. */
-static double least_squared(const struct flat *f, const double share[3], struct vec3 p)
+/* Of a barycentric coordinate below zero the squared distance it stands for; else zero. */
+static inline double beyond(double coordinate, double share)
 {
-	struct vec3 d = vec3_sub(p, f->a);
-	double db = vec3_dot(d, f->ab), dc = vec3_dot(d, f->ac), height = vec3_dot(d, f->normal);
-	double s = f->ac_ac * db - f->ab_ac * dc, t = f->ab_ab * dc - f->ab_ac * db;
-	double first = beyond(s, share[0]), second = beyond(t, share[1]);
-	double third = beyond(f->determinant - s - t, share[2]);
-	first = first > second ? first : second;
-	return height * height + (first > third ? first : third);
+	double twice = coordinate - fabs(coordinate); /* written so that compilers take two at a time */
+	return twice * twice * share;
+}
+
+/* Of each triangle the squared height of p, plus how far it lies beyond the side it is farthest outside of. Returns the
+ * least of them. */
+static double least_squared(const struct fan *fan, struct vec3 p, double ret_least[FAN_MAX])
+{
+	struct vec3 d = vec3_sub(p, fan->a);
+	for (uint32_t k = 0, n = pairs(fan); k < n; k++) {
+		double db = d.x * fan->ab[0][k] + d.y * fan->ab[1][k] + d.z * fan->ab[2][k];
+		double dc = d.x * fan->ac[0][k] + d.y * fan->ac[1][k] + d.z * fan->ac[2][k];
+		double height = d.x * fan->normal[0][k] + d.y * fan->normal[1][k] + d.z * fan->normal[2][k];
+		double s = fan->ac_ac[k] * db - fan->ab_ac[k] * dc, t = fan->ab_ab[k] * dc - fan->ab_ac[k] * db;
+		double first = beyond(s, fan->share[0][k]), second = beyond(t, fan->share[1][k]);
+		double third = beyond(fan->determinant[k] - s - t, fan->share[2][k]);
+		first = first > second ? first : second;
+		ret_least[k] = height * height + (first > third ? first : third);
+	}
+	double least = INFINITY;
+	for (uint32_t k = 0; k < fan->n; k++)
+		least = ret_least[k] < least ? ret_least[k] : least;
+	return least;
+}
+
+/* The triangles, one bit each, whose bound is not above `most`. */
+static uint32_t candidates(const struct fan *fan, const double least[FAN_MAX], double most)
+{
+	uint32_t set = 0;
+	for (uint32_t k = 0; k < fan->n; k++)
+		set |= (uint32_t) !(least[k] > most) << k;
+	return set;
 }
 
 uint32_t fan_nearest(const struct fan *fan, struct vec3 p, double *ret_squared)
 {
 	double least[FAN_MAX];
-	uint32_t best = 0;
-	for (uint32_t k = 0; k < fan->n; k++) {
-		least[k] = least_squared(&fan->flat[k], fan->share[k], p);
-		best = least[k] < least[best] ? k : best;
-	}
-	double squared = flat_distance_squared(&fan->flat[best], p);
-	for (uint32_t k = 0, first = best; k < fan->n; k++) {
-		if (k == first || least[k] > squared + BOUND_SLACK)
-			continue;
-		double other = flat_distance_squared(&fan->flat[k], p);
+	double lowest = least_squared(fan, p, least);
+	uint32_t best = (uint32_t)__builtin_ctz(candidates(fan, least, lowest));
+	struct flat flat = flat_of(fan, best);
+	double squared = to_flat(&flat, p);
+	uint32_t set = candidates(fan, least, squared + BOUND_SLACK) & ~(1u << best);
+	for (; set; set &= set - 1) {
+		uint32_t k = (uint32_t)__builtin_ctz(set);
+		flat = flat_of(fan, k);
+		double other = to_flat(&flat, p);
 		if (other < squared || (other == squared && k < best)) {
 			squared = other;
 			best = k;

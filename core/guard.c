@@ -50,3 +50,25 @@ bool guard_shape(const struct halfedge_mesh *mesh, const struct halfedge_ring *r
 	}
 	return true;
 }
+
+bool guard_fan(const struct fan *fan, struct vec3 v, double cosine)
+{
+	double before[FAN_MAX], after[FAN_MAX], dot[FAN_MAX];
+	struct vec3 back = vec3_sub(v, fan->a);
+	bool all = true;
+	for (uint32_t k = 0; k < fan->n; k++) {
+		double bx = fan->ab[0][k] - back.x, by = fan->ab[1][k] - back.y, bz = fan->ab[2][k] - back.z;
+		double cx = fan->ac[0][k] - back.x, cy = fan->ac[1][k] - back.y, cz = fan->ac[2][k] - back.z;
+		double x = by * cz - bz * cy, y = bz * cx - bx * cz, z = bx * cy - by * cx;
+		double nx = fan->normal[0][k], ny = fan->normal[1][k], nz = fan->normal[2][k];
+		before[k] = x * x + y * y + z * z;
+		after[k] = nx * nx + ny * ny + nz * nz;
+		dot[k] = x * nx + y * ny + z * nz;
+	}
+	for (uint32_t k = 0; k < fan->n; k++) {
+		double longest = fan->ab_ab[k] > fan->ac_ac[k] ? fan->ab_ab[k] : fan->ac_ac[k];
+		longest = longest > fan->bc_bc[k] ? longest : fan->bc_bc[k];
+		all &= guard_lengths(before[k], after[k], dot[k], longest, cosine);
+	}
+	return all;
+}

@@ -210,40 +210,20 @@ static void notice(struct pass *pass, uint32_t v)
 		give_turn(pass, v);
 }
 
-/* A triangle of the fan, its normal as long as twice the area. */
-static struct flat open_flat(const struct pass *pass, uint32_t a, uint32_t b, uint32_t c)
-{
-	struct flat flat = {.a = pass->spot[a].at};
-	flat.ab = vec3_sub(pass->spot[b].at, flat.a);
-	flat.ac = vec3_sub(pass->spot[c].at, flat.a);
-	flat.normal = vec3_cross(flat.ab, flat.ac);
-	flat.ab_ab = vec3_dot(flat.ab, flat.ab);
-	flat.ab_ac = vec3_dot(flat.ab, flat.ac);
-	flat.ac_ac = vec3_dot(flat.ac, flat.ac);
-	return flat;
-}
-
 /* Lays out the triangles that stay when v moves into u, as they then lie; false where one turns too far or gets thin. */
 static bool lay_fan(struct pass *pass, uint32_t u)
 {
 	const struct halfedge_ring *ring = &pass->ring;
-	assert(ring->n <= FAN_MAX); /* with more, VALENCE_MAX refuses it */
-	struct vec3 back = vec3_sub(pass->spot[ring->v].at, pass->spot[u].at);
 	struct fan *fan = &pass->fan;
-	fan->n = 0;
+	assert(ring->n <= FAN_MAX); /* with more, VALENCE_MAX refuses it */
+	fan_begin(fan, pass->spot[u].at);
 	for (uint32_t k = 0; k < ring->n; k++) {
-		if (ring->x[k] == u || ring->y[k] == u)
-			continue;
-		struct flat *flat = &fan->flat[fan->n];
-		*flat = open_flat(pass, u, ring->x[k], ring->y[k]);
-		double longest = flat->ab_ab > flat->ac_ac ? flat->ab_ab : flat->ac_ac;
-		double third = flat->ab_ab + flat->ac_ac - 2 * flat->ab_ac;
-		struct vec3 before = vec3_cross(vec3_sub(flat->ab, back), vec3_sub(flat->ac, back));
-		if (!guard_normals(before, flat->normal, longest > third ? longest : third, COSINE_TURN))
-			return false;
-		pass->fan_triangle[fan->n++] = ring->h[k] / 3;
+		pass->fan_triangle[fan->n] = ring->h[k] / 3;
+		if (ring->x[k] != u && ring->y[k] != u)
+			fan_add(fan, pass->spot[ring->x[k]].at, pass->spot[ring->y[k]].at);
 	}
-	return true;
+	fan_span(fan);
+	return guard_fan(fan, pass->spot[ring->v].at, COSINE_TURN);
 }
 
 /* The rest of what distances need. Where no triangle stays, the fan is the one behind the tip of h. */
@@ -255,9 +235,10 @@ static void close_fan(struct pass *pass, uint32_t h)
 		uint32_t next = mesh->twin[halfedge_next(h)], previous = mesh->twin[halfedge_previous(h)];
 		uint32_t t = (next != HALFEDGE_NONE ? next : previous) / 3;
 		const uint32_t *corner = &mesh->origin[3 * t];
-		fan->flat[0] = open_flat(pass, corner[0], corner[1], corner[2]);
+		fan_begin(fan, pass->spot[corner[0]].at);
+		fan_add(fan, pass->spot[corner[1]].at, pass->spot[corner[2]].at);
+		fan_span(fan);
 		pass->fan_triangle[0] = t;
-		fan->n = 1;
 	}
 	fan_close(fan);
 }
@@ -278,8 +259,7 @@ static bool rim_point_near(const struct pass *pass, uint32_t p)
 {
 	double squared;
 	struct vec3 at = pass->s->origin[p];
-	const struct flat *flat = &pass->fan.flat[fan_nearest(&pass->fan, at, &squared)];
-	double height = vec3_dot(vec3_sub(at, flat->a), flat->normal);
+	double height = fan_height(&pass->fan, fan_nearest(&pass->fan, at, &squared), at);
 	return squared <= pass->s->rim_squared && height * height <= pass->s->tolerance_squared;
 }
 
@@ -425,14 +405,16 @@ static void commit(struct pass *pass, uint32_t v, uint32_t u, uint32_t h, bool r
 static bool flats_stay_near(const struct pass *pass)
 {
 	const struct nearby *nearby = &pass->s->nearby;
-	for (uint32_t f = 0; f < pass->fan.n; f++) {
-		const struct flat *flat = &pass->fan.flat[f];
-		if (!nearby_has_segment(nearby, flat->a, vec3_add(flat->a, flat->ab)))
+	const struct fan *fan = &pass->fan;
+	for (uint32_t k = 0; k < fan->n; k++) {
+		struct vec3 ab = {fan->ab[0][k], fan->ab[1][k], fan->ab[2][k]};
+		struct vec3 ac = {fan->ac[0][k], fan->ac[1][k], fan->ac[2][k]};
+		if (!nearby_has_segment(nearby, fan->a, vec3_add(fan->a, ab)))
 			return false;
-		if (flat->ab_ab + flat->ac_ac - 2 * flat->ab_ac <= WIDE * WIDE)
+		if (fan->bc_bc[k] <= WIDE * WIDE)
 			continue;
-		struct vec3 middle = vec3_scale(vec3_add(flat->ab, flat->ac), 0.5);
-		if (!nearby_has_segment(nearby, flat->a, vec3_add(flat->a, middle)))
+		struct vec3 middle = vec3_scale(vec3_add(ab, ac), 0.5);
+		if (!nearby_has_segment(nearby, fan->a, vec3_add(fan->a, middle)))
 			return false;
 	}
 	return true;

@@ -7,14 +7,20 @@
 #include <errno.h>
 #include <string.h>
 
-#define SIDE  PATCH_SIDE
-#define CELLS (SIDE * SIDE * SIDE)
-#define STEP  (1.2 * LATTICE)
+#define SIDE       (PATCH_SIDE + 1) /* 4096 is a place, too */
+#define CELLS      (SIDE * SIDE * SIDE)
+#define SURE_REACH 241 /* of a point that was rounded towards zero */
+#define STEP       (1.2 * LATTICE)
 
-static int cell_of(double coordinate)
+static uint32_t cell_of(double coordinate)
 {
 	int cell = (int)(coordinate / LATTICE); /* rounding up below zero ends at the same cell */
-	return cell < 0 ? 0 : cell >= SIDE ? SIDE - 1 : cell;
+	return cell < 0 ? 0 : cell >= SIDE ? SIDE - 1 : (uint32_t)cell;
+}
+
+static uint32_t cell_at(uint32_t x, uint32_t y, uint32_t z)
+{
+	return (z * SIDE + y) * SIDE + x;
 }
 
 int nearby_init(struct nearby *nearby, const struct surface *raw, struct arena *arena)
@@ -26,14 +32,14 @@ int nearby_init(struct nearby *nearby, const struct surface *raw, struct arena *
 	memset(nearby->first, 0xff, CELLS * sizeof *nearby->first);
 	for (uint32_t v = 0; v < raw->nv; v++) {
 		const uint16_t *p = raw->vertex[v];
-		int cell = (cell_of(p[2]) * SIDE + cell_of(p[1])) * SIDE + cell_of(p[0]);
+		uint32_t cell = cell_at(p[0] / LATTICE, p[1] / LATTICE, p[2] / LATTICE);
 		nearby->next[v] = nearby->first[cell];
 		nearby->first[cell] = v;
 	}
 	return 0;
 }
 
-static bool in_cell(const struct nearby *nearby, int cell, struct vec3 p)
+static bool in_cell(const struct nearby *nearby, uint32_t cell, struct vec3 p)
 {
 	for (uint32_t v = nearby->first[cell]; v != UINT32_MAX; v = nearby->next[v]) {
 		const uint16_t *at = nearby->vertex[v];
@@ -45,36 +51,60 @@ static bool in_cell(const struct nearby *nearby, int cell, struct vec3 p)
 }
 
 /* The cells from `low` to `high`, both among the cells of the patch. */
-static bool in_cells(const struct nearby *nearby, const int low[3], const int high[3], struct vec3 p)
+static bool in_cells(const struct nearby *nearby, const uint32_t low[3], const uint32_t high[3], struct vec3 p)
 {
-	for (int z = low[2]; z <= high[2]; z++)
-		for (int y = low[1]; y <= high[1]; y++)
-			for (int x = low[0]; x <= high[0]; x++)
-				if (in_cell(nearby, (z * SIDE + y) * SIDE + x, p))
+	for (uint32_t z = low[2]; z <= high[2]; z++)
+		for (uint32_t y = low[1]; y <= high[1]; y++)
+			for (uint32_t x = low[0]; x <= high[0]; x++)
+				if (in_cell(nearby, cell_at(x, y, z), p))
 					return true;
 	return false;
 }
 
-/* A vertex on an edge of the cell of p is listed there or in a cell above it: these answer nearly always. */
 bool nearby_has(const struct nearby *nearby, struct vec3 p)
 {
-	int at[3] = {cell_of(p.x), cell_of(p.y), cell_of(p.z)}, low[3], high[3];
+	uint32_t at[3] = {cell_of(p.x), cell_of(p.y), cell_of(p.z)}, low[3], high[3];
 	for (int axis = 0; axis < 3; axis++) {
 		low[axis] = at[axis] ? at[axis] - 1 : 0;
 		high[axis] = at[axis] < SIDE - 1 ? at[axis] + 1 : at[axis];
 	}
-	return in_cells(nearby, at, high, p) || in_cells(nearby, low, high, p);
+	return in_cells(nearby, low, high, p);
 }
 
-bool nearby_has_segment(const struct nearby *nearby, struct vec3 a, struct vec3 b)
+/* One vertex of a cell, or just any vertex: what is within reach is within reach. */
+static unsigned first_reaches(const struct nearby *nearby, uint32_t cell, const uint32_t p[3])
 {
-	struct vec3 along = vec3_sub(b, a);
-	double squared = vec3_dot(along, along);
-	if (squared <= 4 * NEARBY_REACH * NEARBY_REACH)
-		return true;
-	int steps = (int)(sqrt(squared) / STEP) + 1;
-	for (int k = 1; k < steps; k++)
-		if (!nearby_has(nearby, vec3_add(a, vec3_scale(along, (double)k / steps))))
+	uint32_t v = nearby->first[cell];
+	const uint16_t *at = nearby->vertex[v != UINT32_MAX ? v : 0];
+	uint32_t x = at[0] - p[0], y = at[1] - p[1], z = at[2] - p[2]; /* below zero, too, their squares are right */
+	return x * x + y * y + z * z <= SURE_REACH * SURE_REACH;
+}
+
+/* Raw vertices lie on the edges between cells. Where p is on the surface, one of the three nearest edges, one an axis,
+ * nearly always has one, listed in the cell above it. True is sure, false is not; there is no branch to guess. */
+static bool on_nearest_edges(const struct nearby *nearby, struct vec3 p)
+{
+	const uint32_t at[3] = {(uint32_t)(int)p.x, (uint32_t)(int)p.y, (uint32_t)(int)p.z};
+	uint32_t x = at[0] / LATTICE, y = at[1] / LATTICE, z = at[2] / LATTICE;
+	uint32_t i = (at[0] + LATTICE / 2) / LATTICE, j = (at[1] + LATTICE / 2) / LATTICE;
+	uint32_t k = (at[2] + LATTICE / 2) / LATTICE;
+	return (first_reaches(nearby, cell_at(x, j, k), at) | first_reaches(nearby, cell_at(i, y, k), at) |
+	        first_reaches(nearby, cell_at(i, j, z), at)) != 0;
+}
+
+int nearby_parts(double length_squared)
+{
+	int parts = (int)(sqrt(length_squared) / STEP) + 1;
+	return length_squared <= 4 * NEARBY_REACH * NEARBY_REACH ? 1 : parts;
+}
+
+bool nearby_has_segment(const struct nearby *nearby, struct vec3 a, struct vec3 along, int parts)
+{
+	bool all = true;
+	for (int k = 1; k < parts; k++)
+		all &= on_nearest_edges(nearby, vec3_add(a, vec3_scale(along, (double)k / parts)));
+	for (int k = 1; k < parts && !all; k++)
+		if (!nearby_has(nearby, vec3_add(a, vec3_scale(along, (double)k / parts))))
 			return false;
 	return true;
 }

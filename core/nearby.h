@@ -19,7 +19,10 @@ int nearby_init(struct nearby *, const struct surface *raw, struct arena *arena)
 #define NEARBY_REACH (0.95 * LATTICE)
 bool nearby_has(const struct nearby *, struct vec3 p);
 
-/* Whether all of the segment a-b, sampled at most 1.2 cells apart, is near raw vertices; its ends are not looked at. */
-bool nearby_has_segment(const struct nearby *, struct vec3 a, struct vec3 b);
+/* Into how many parts a segment is cut to be looked at, at most 1.2 cells long; one where its ends vouch for it. */
+int nearby_parts(double length_squared);
+
+/* Whether the points between the parts of the segment from a are near raw vertices. */
+bool nearby_has_segment(const struct nearby *, struct vec3 a, struct vec3 along, int parts);
 
 #endif

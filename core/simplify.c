@@ -42,6 +42,14 @@ struct spot {
 	double planes; /* weight of its quadric */
 };
 
+/* Where a vertex may go, side by side: what is asked of one is asked of all. A vertex with more has several rounds. */
+#define WAYS_MAX 8
+struct ways {
+	uint32_t n, u[WAYS_MAX], h[WAYS_MAX];
+	double x[WAYS_MAX], y[WAYS_MAX], z[WAYS_MAX], own[WAYS_MAX], planes[WAYS_MAX];
+	double cost[WAYS_MAX];
+};
+
 struct pass {
 	struct simplify *s;
 	struct spot *spot;   /* [nv] */
@@ -52,6 +60,7 @@ struct pass {
 	bool *on_rim;        /* [nv] */
 	bool *tried;         /* [nv] a cheaper target was refused since the last change around */
 	uint32_t *rim, rims; /* vertices that were on a border at the start */
+	struct ways ways;
 	struct halfedge_ring ring; /* of the vertex whose turn it is */
 	struct fan fan;            /* its triangles that stay, as they then lie */
 	uint32_t fan_triangle[FAN_MAX];
@@ -153,49 +162,94 @@ static void note_own(struct pass *pass, uint32_t u)
 	spot->planes = quadric->planes;
 }
 
-/* Cost of moving v into u, or INFINITY where the mean quadric is beyond the tolerance. */
-static double cost_of(const struct pass *pass, uint32_t v, uint32_t u)
+static void add_way(const struct spot *spot, uint32_t u, uint32_t h, struct ways *ways)
 {
-	const struct spot *from = &pass->spot[v], *to = &pass->spot[u];
-	const double at[3] = {to->at.x, to->at.y, to->at.z};
-	double sum = quadric_at(&pass->s->quadric[v], at) + to->own;
-	struct vec3 way = vec3_sub(to->at, from->at);
-	double cost = ERROR_SHARE * sum + LENGTH_SHARE * vec3_dot(way, way);
-	cost = cost > 0 ? cost : 0;
-	return sum > pass->s->tolerance_squared * (from->planes + to->planes) ? INFINITY : cost;
+	uint32_t k = ways->n++;
+	ways->u[k] = u;
+	ways->h[k] = h;
+	ways->x[k] = spot[u].at.x;
+	ways->y[k] = spot[u].at.y;
+	ways->z[k] = spot[u].at.z;
+	ways->own[k] = spot[u].own;
+	ways->planes[k] = spot[u].planes;
 }
 
-static void look_at(const struct pass *pass, uint32_t v, uint32_t h, const struct target *floor, struct target *best)
+/* Costs of moving v along each way; INFINITY where the mean quadric is beyond the tolerance. */
+static void cost_ways(const struct pass *pass, uint32_t v, struct ways *ways)
 {
-	uint32_t u = halfedge_other(&pass->s->mesh, h, v);
-	double cost = cost_of(pass, v, u);
-	if ((cost < best->cost || (cost == best->cost && u < best->u)) &&
-	    (cost > floor->cost || (cost == floor->cost && u > floor->u)))
-		*best = (struct target){cost, u, h};
+	const struct quadric quadric = pass->s->quadric[v];
+	const struct spot from = pass->spot[v];
+	double tolerance_squared = pass->s->tolerance_squared;
+	for (uint32_t k = 0; k < WAYS_MAX; k++) {
+		const double at[3] = {ways->x[k], ways->y[k], ways->z[k]};
+		double x = at[0] - from.at.x, y = at[1] - from.at.y, z = at[2] - from.at.z;
+		double sum = quadric_at(&quadric, at) + ways->own[k];
+		double cost = ERROR_SHARE * sum + LENGTH_SHARE * (x * x + y * y + z * z);
+		cost = cost > 0 ? cost : 0;
+		ways->cost[k] = sum > tolerance_squared * (from.planes + ways->planes[k]) ? INFINITY : cost;
+	}
 }
 
-/* The cheapest target of v that comes after `floor`; its cost is INFINITY where there is none. */
-static struct target best_target(const struct pass *pass, uint32_t v, const struct target *floor)
+/* The cheapest way, of several that to the smallest vertex, if it comes before `best`. */
+static void choose_way(const struct ways *ways, struct target *best)
+{
+	double least[WAYS_MAX / 2];
+	uint32_t ties = 0;
+	for (uint32_t k = 0; k < WAYS_MAX / 2; k++)
+		least[k] = ways->cost[k] < ways->cost[k + WAYS_MAX / 2] ? ways->cost[k] : ways->cost[k + WAYS_MAX / 2];
+	for (uint32_t k = 1; k < WAYS_MAX / 2; k++)
+		least[0] = least[k] < least[0] ? least[k] : least[0];
+	if (least[0] == INFINITY)
+		return;
+	for (uint32_t k = 0; k < WAYS_MAX; k++)
+		ties |= (uint32_t)(ways->cost[k] == least[0]) << k;
+	for (; ties; ties &= ties - 1) {
+		uint32_t k = (uint32_t)__builtin_ctz(ties);
+		if (least[0] < best->cost || (least[0] == best->cost && ways->u[k] < best->u))
+			*best = (struct target){least[0], ways->u[k], ways->h[k]};
+	}
+}
+
+/* The ways up to `floor` are out. */
+static void rule_out(struct ways *ways, const struct target *floor)
+{
+	for (uint32_t k = 0; k < ways->n; k++)
+		if (ways->cost[k] < floor->cost || (ways->cost[k] == floor->cost && ways->u[k] <= floor->u))
+			ways->cost[k] = INFINITY;
+}
+
+/* The cheapest target of v that comes after `floor`, or NULL; its cost is INFINITY where there is none. */
+static struct target best_target(struct pass *pass, uint32_t v, const struct target *floor)
 {
 	const struct halfedge_mesh *mesh = &pass->s->mesh;
 	struct target best = {INFINITY, 0, HALFEDGE_NONE};
-	if (pass->on_rim[v]) {
-		look_at(pass, v, halfedge_border_from(mesh, v), floor, &best);
-		look_at(pass, v, halfedge_border_into(mesh, v), floor, &best);
-		return best;
+	struct ways *ways = &pass->ways;
+	for (uint32_t h = mesh->first[v]; h != HALFEDGE_NONE;) {
+		ways->n = 0;
+		for (uint32_t k = 0; k < WAYS_MAX; k++)
+			ways->planes[k] = -INFINITY; /* no way costs INFINITY */
+		if (pass->on_rim[v]) {
+			uint32_t from = halfedge_border_from(mesh, v), into = halfedge_border_into(mesh, v);
+			add_way(pass->spot, halfedge_target(mesh, from), from, ways);
+			add_way(pass->spot, mesh->origin[into], into, ways);
+			h = HALFEDGE_NONE;
+		}
+		for (; h != HALFEDGE_NONE && ways->n < WAYS_MAX; h = mesh->next_leaving[h])
+			add_way(pass->spot, halfedge_target(mesh, h), h, ways);
+		cost_ways(pass, v, ways);
+		if (floor)
+			rule_out(ways, floor);
+		choose_way(ways, &best);
 	}
-	HALFEDGE_EACH(mesh, h, v)
-	look_at(pass, v, h, floor, &best);
 	return best;
 }
 
 /* What v would cost, as of now. */
 static void give_turn(struct pass *pass, uint32_t v)
 {
-	const struct target none = {-1, 0, HALFEDGE_NONE};
 	pass->tried[v] = false;
 	pass->stale[v] = false;
-	pass->best[v] = best_target(pass, v, &none);
+	pass->best[v] = best_target(pass, v, NULL);
 	set_key(pass, v, pass->best[v].cost);
 }
 
@@ -406,15 +460,17 @@ static bool flats_stay_near(const struct pass *pass)
 {
 	const struct nearby *nearby = &pass->s->nearby;
 	const struct fan *fan = &pass->fan;
+	int edge[FAN_MAX], middle[FAN_MAX]; /* parts */
+	for (uint32_t k = 0; k < fan->n; k++) {
+		double squared = (fan->ab_ab[k] + fan->ac_ac[k] + 2 * fan->ab_ac[k]) / 4;
+		edge[k] = nearby_parts(fan->ab_ab[k]);
+		middle[k] = fan->bc_bc[k] > WIDE * WIDE ? nearby_parts(squared) : 1;
+	}
 	for (uint32_t k = 0; k < fan->n; k++) {
 		struct vec3 ab = {fan->ab[0][k], fan->ab[1][k], fan->ab[2][k]};
 		struct vec3 ac = {fan->ac[0][k], fan->ac[1][k], fan->ac[2][k]};
-		if (!nearby_has_segment(nearby, fan->a, vec3_add(fan->a, ab)))
-			return false;
-		if (fan->bc_bc[k] <= WIDE * WIDE)
-			continue;
-		struct vec3 middle = vec3_scale(vec3_add(ab, ac), 0.5);
-		if (!nearby_has_segment(nearby, fan->a, vec3_add(fan->a, middle)))
+		if (!nearby_has_segment(nearby, fan->a, ab, edge[k]) ||
+		    !nearby_has_segment(nearby, fan->a, vec3_scale(vec3_add(ab, ac), 0.5), middle[k]))
 			return false;
 	}
 	return true;

@@ -171,7 +171,7 @@ static bool turned_alike(const struct grower *g, uint32_t t)
 
 static bool fits(const struct grower *g, uint32_t t)
 {
-	const uint32_t *corner = &g->s->mesh.origin[3 * t];
+	const uint32_t *corner = g->s->mesh.origin + 3 * t;
 	return turned_alike(g, t) && in_slab(g, corner[0]) && in_slab(g, corner[1]) && in_slab(g, corner[2]);
 }
 
@@ -375,7 +375,7 @@ struct covers {
 
 static void cover_make(const struct grower *g, uint32_t t, struct cover *ret)
 {
-	const uint32_t *corner = &g->s->mesh.origin[3 * t];
+	const uint32_t *corner = g->s->mesh.origin + 3 * t;
 	for (int k = 0; k < 3; k++) {
 		const int32_t *a = g->projected[corner[k]], *b = g->projected[corner[(k + 1) % 3]];
 		ret->edge[k][0] = a[1] - b[1];
@@ -387,7 +387,7 @@ static void cover_make(const struct grower *g, uint32_t t, struct cover *ret)
 
 static void note_strips(const struct grower *g, struct covers *covers, uint32_t k)
 {
-	const uint32_t *corner = &g->s->mesh.origin[3 * g->taken[k]];
+	const uint32_t *corner = g->s->mesh.origin + 3 * g->taken[k];
 	const int32_t *a = g->projected[corner[0]], *b = g->projected[corner[1]], *c = g->projected[corner[2]];
 	for (int axis = 0; axis < 2; axis++) {
 		int32_t low = a[axis] < b[axis] ? a[axis] : b[axis], high = a[axis] < b[axis] ? b[axis] : a[axis];
@@ -430,7 +430,7 @@ static bool hand_to(struct grower *g, uint32_t v, struct cover *cover, uint32_t 
 	struct simplify *s = g->s;
 	if (!covers_point(cover, g->projected[v]))
 		return false;
-	const uint32_t *corner = &s->mesh.origin[3 * t];
+	const uint32_t *corner = s->mesh.origin + 3 * t;
 	if (!cover->made)
 		cover->flat = flat_make(g->place[corner[0]], g->place[corner[1]], g->place[corner[2]]);
 	cover->made = true;
@@ -487,9 +487,8 @@ static void remove_all(struct grower *g, uint32_t number, struct former *ret)
 		*link = HALFEDGE_NONE;
 	}
 	for (uint32_t k = 0; k < g->n; k++) {
-		uint32_t *origin = &mesh->origin[3 * g->taken[k]], *twin = &mesh->twin[3 * g->taken[k]];
-		memcpy(ret[k].origin, origin, sizeof ret[k].origin);
-		memcpy(ret[k].twin, twin, sizeof ret[k].twin);
+		memcpy(ret[k].origin, mesh->origin + 3 * g->taken[k], sizeof ret[k].origin);
+		memcpy(ret[k].twin, mesh->twin + 3 * g->taken[k], sizeof ret[k].twin);
 	}
 	for (uint32_t k = 0; k < g->n; k++)
 		for (uint32_t h = 3 * g->taken[k]; h < 3 * g->taken[k] + 3; h++) {
@@ -732,7 +731,7 @@ int region_flatten(struct simplify *s, struct arena *arena, struct reduce_stats 
 	int r = prepare(&g, s, arena);
 	if (!r)
 		r = sort_bins(&g, &bins);
-	for (uint32_t k = 0; k < bins.n && !r; k++)
+	for (uint32_t k = 0; !r && k < bins.n; k++)
 		r = search_bin(&g, &bins, bins.order[k], &number, stats);
 	return r;
 }

@@ -36,6 +36,7 @@ struct slot {
 
 struct field {
 	struct field_params params;
+	double per_m; /* cells */
 	struct fold *fold;
 	struct slot slot[RASTERS_MAX];
 	uint32_t cloud_points; /* since field_fold_points */
@@ -51,6 +52,7 @@ struct field *field_create(const struct field_params *params, struct grid *grid)
 	if (!field)
 		return NULL;
 	field->params = *params;
+	field->per_m = 1 / params->cell_m;
 	field->fold = fold_create(grid);
 	if (!field->fold) {
 		free(field);
@@ -73,7 +75,7 @@ void field_destroy(struct field *field)
 
 static struct vec3 origin_of(const struct field *field, const struct raster_line *line, int32_t c)
 {
-	return vec3_scale(raster_beam(line, c)->origin, 1 / field->params.cell_m);
+	return vec3_scale(raster_beam(line, c)->origin, field->per_m);
 }
 
 static struct vec3 normal_of(const struct raster_line *line, int32_t c)
@@ -326,8 +328,7 @@ int field_flush(struct field *field)
 
 void field_point(struct field *field, struct vec3 origin, struct vec3 point)
 {
-	double scale = 1 / field->params.cell_m;
-	struct vec3 p = vec3_scale(point, scale), o = vec3_scale(origin, scale);
+	struct vec3 p = vec3_scale(point, field->per_m), o = vec3_scale(origin, field->per_m);
 
 	if (!raster_within_map(p) || !raster_within_map(o)) {
 		field->stats.far_points++;

@@ -218,7 +218,7 @@ static void rule_out(struct ways *ways, const struct target *floor)
 			ways->cost[k] = INFINITY;
 }
 
-/* The cheapest target of v that comes after `floor`, or NULL; its cost is INFINITY where there is none. */
+/* The cheapest target of v, after `floor` unless that is NULL; its cost is INFINITY where there is none. */
 static struct target best_target(struct pass *pass, uint32_t v, const struct target *floor)
 {
 	const struct halfedge_mesh *mesh = &pass->s->mesh;

@@ -72,9 +72,27 @@ static void leave_language(struct web_connection *c)
 	c->web->clients--;
 }
 
+static void on_door(uv_poll_t *door, int status, int events);
+
+static void open_door(struct web *web)
+{
+	if (web->polling || !web->open || web->stopped)
+		return;
+	web->polling = true;
+	uv_poll_start(&web->door, UV_READABLE, on_door);
+}
+
+/* Until a connection has gone, or the next tick: level-triggered polling would spin. */
+static void shut_door(struct web *web)
+{
+	uv_poll_stop(&web->door);
+	web->polling = false;
+}
+
 static void free_connection(struct web_connection *c)
 {
-	struct web_connection **at = &c->web->connections;
+	struct web *web = c->web;
+	struct web_connection **at = &web->connections;
 
 	leave_language(c);
 	web_answer_finish(&c->answer);
@@ -82,8 +100,10 @@ static void free_connection(struct web_connection *c)
 	while (*at != c)
 		at = &(*at)->next;
 	*at = c->next;
-	c->web->count--;
+	web->count--;
+	web->evicted -= c->evicted;
 	free(c);
+	open_door(web);
 }
 
 /* Languages */
@@ -323,6 +343,8 @@ static bool evict(struct web *web)
 	if (!oldest)
 		return false;
 	oldest->stage = STAGE_ANSWERED; /* not twice */
+	oldest->evicted = true;
+	web->evicted++;
 	lws_set_timeout(oldest->wsi, PENDING_TIMEOUT_USER_OK, LWS_TO_KILL_ASYNC);
 	return true;
 }
@@ -375,6 +397,10 @@ static void on_door(uv_poll_t *door, int status, int events)
 	(void)status;
 	(void)events;
 	for (int i = 0; i < ACCEPTS_MAX; i++) {
+		if (web->evicted > 0 && web->count >= limit(web) + PLAIN_MAX) {
+			shut_door(web); /* who comes next waits until they are gone */
+			return;
+		}
 		struct sockaddr_storage from = {0};
 		socklen_t len = sizeof(from);
 		const int fd = accept4(web->listener.fd, (struct sockaddr *)&from, &len, SOCK_NONBLOCK | SOCK_CLOEXEC);
@@ -383,11 +409,8 @@ static void on_door(uv_poll_t *door, int status, int events)
 			welcome(web, fd, &from);
 			continue;
 		}
-		if (errno == EMFILE || errno == ENFILE || errno == ENOBUFS || errno == ENOMEM) {
-			/* Level-triggered polling would spin: the door opens again at the next tick. */
-			uv_poll_stop(door);
-			web->polling = false;
-		}
+		if (errno == EMFILE || errno == ENFILE || errno == ENOBUFS || errno == ENOMEM)
+			shut_door(web);
 		if (errno != ECONNABORTED && errno != EINTR)
 			return;
 	}
@@ -397,12 +420,7 @@ static void on_door(uv_poll_t *door, int status, int events)
 
 static void on_tick(uv_timer_t *tick)
 {
-	struct web *web = tick->data;
-
-	if (web->polling)
-		return;
-	web->polling = true;
-	uv_poll_start(&web->door, UV_READABLE, on_door);
+	open_door(tick->data);
 }
 
 static int64_t deadline_of(const struct web_connection *c)

@@ -20,6 +20,7 @@ struct web_connection {
 	struct web_connection *next;
 	struct lws *wsi; /* NULL until it is libwebsockets' */
 	bool owned;      /* ... which ends it */
+	bool evicted;    /* to make room for others: on its way out */
 	uint64_t id;
 	struct sockaddr_storage from;
 	char address[64];
@@ -69,6 +70,7 @@ struct web {
 	bool open, polling, stopped;
 	struct web_connection *connections;
 	size_t count, clients; /* all; of those that speak */
+	size_t evicted;        /* not gone yet */
 	uint64_t next_id;
 	struct web_connection *arriving; /* while it is handed over */
 	uint8_t out[LWS_PRE + WEB_PIECE_MAX];

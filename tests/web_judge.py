@@ -253,6 +253,7 @@ def two_snapshots_are_sent_at_once_and_a_third_has_to_wait(d):
 def a_client_that_stops_reading_costs_nothing_and_converges(d, stalled, mirror):
     mine = [c for c in d.status()["clients"] if c["kind"] == "web" and c["behind"] > 0]
     check(mine and mine[0]["behind_peak"] >= 20 and mine[0]["queued"] <= 256 << 10, f"the stalled client: {mine}")
+    check(until(lambda: d.status()["queue"]["idle"]), "the map stands") # what waited for its look-ahead is in it
     follow(stalled, mirror, d.status()["step"])
     fresh, whole = WebSocket(d.port), Mirror()
     fresh.want()
@@ -537,6 +538,9 @@ def a_hundred_connections_that_say_nothing_shut_nobody_out():
         begin = time.monotonic()
         check(ask(d.port, "/status.json")[0] == 200, "a request among 100 silent connections")
         check(time.monotonic() - begin < 5, "... soon")
+        for _ in range(3): # more at once than there is room for: who is over waits, nobody is refused
+            idle += [dial(d.port) for _ in range(100)]
+            check(ask(d.port, "/status.json")[0] == 200, "a request behind 100 more")
         ws = WebSocket(d.port)
         check(ws.code == 101, "a WebSocket among them")
         after = d.status()["memory"]["rss"]

@@ -403,20 +403,28 @@ static void columns_move(struct fold *fold, struct scratch_block *from, int axis
 				continue;
 			number = number_of(to, voxel, &place);
 			column_of(fold, from, to, number)->at[place] += at[i];
-			at[i] = 0;
 		}
 	}
+}
+
+static void columns_drop(struct scratch_block *from, int axis)
+{
+	for (uint64_t bits = from->seen[axis]; bits; bits &= bits - 1)
+		memset(from->column[axis][__builtin_ctzll(bits)], 0, sizeof(struct column));
 	from->seen[axis] = 0;
 }
 
-/* Gathers all columns of a block in one axis, which it says. Few blocks of a row see more than one. */
+/* Gathers all columns of a block in one axis, which it says. Few blocks of a row see more than one. Without memory those of
+ * the other axes are lost. */
 static int columns_gather(struct fold *fold, struct scratch_block *from)
 {
 	int to = from->seen[2] ? 2 : from->seen[1] ? 1 : 0;
 
-	for (int axis = 0; axis < to; axis++)
+	for (int axis = 0; axis < to; axis++) {
 		if (from->seen[axis] && columns_reserve(fold))
 			columns_move(fold, from, axis, to);
+		columns_drop(from, axis);
+	}
 	return to;
 }
 
@@ -521,9 +529,7 @@ static void block_fold(struct fold *fold, struct block *block, struct scratch_bl
 static void block_drop(struct scratch_block *from)
 {
 	for (int axis = 0; axis < 3; axis++)
-		for (uint64_t bits = from->seen[axis]; bits; bits &= bits - 1)
-			memset(from->column[axis][__builtin_ctzll(bits)], 0, sizeof(struct column));
-	memset(from->seen, 0, sizeof(from->seen));
+		columns_drop(from, axis);
 	memset(from->passed, 0, sizeof(from->passed));
 	memset(from->rays, 0, sizeof(from->rays));
 }

@@ -38,10 +38,9 @@ struct map {
 struct mesher {
 	struct arena arena;
 	struct window window;
-	const struct patch
-	    *before;        /* made of the same window, the memo's; NULL: there is none, and `raw` is the surface */
-	struct surface raw; /* in the arena */
-	uint32_t faces;     /* of the window's surface, before the reduction */
+	const struct patch *before; /* the memo's, made of the same window; or NULL */
+	struct surface raw;         /* where there is none; in the arena */
+	uint32_t faces;             /* of the window's surface, before the reduction */
 	struct reduce_stats stats;
 	uint64_t faces_raw;
 };

@@ -111,16 +111,12 @@ int simplify_init(struct simplify *s, const struct surface *raw, const struct bo
 
 void simplify_settle(struct simplify *s)
 {
-	struct halfedge_mesh *mesh = &s->mesh;
-	for (uint32_t v = 0; v < mesh->nv; v++)
-		s->fixed[v] = s->border.kind[v] == BORDER_CHAIN || s->border.kind[v] == BORDER_PINNED;
-	mesh->stamp++;
-	for (uint32_t h = 0; h < 3 * mesh->nt; h++) {
-		uint32_t v = mesh->origin[h];
-		if (mesh->twin[h] != HALFEDGE_NONE || v == HALFEDGE_NONE)
-			continue;
-		s->fixed[v] |= mesh->mark[v] == mesh->stamp; /* fans touch in it */
-		mesh->mark[v] = mesh->stamp;
+	for (uint32_t v = 0; v < s->mesh.nv; v++) {
+		uint32_t borders = 0;
+		HALFEDGE_EACH(&s->mesh, h, v)
+		borders += s->mesh.twin[h] == HALFEDGE_NONE;
+		uint8_t kind = s->border.kind[v];
+		s->fixed[v] = kind == BORDER_CHAIN || kind == BORDER_PINNED || borders > 1;
 	}
 }
 

@@ -11,7 +11,9 @@
 
 #include "core/field.h"
 #include "core/fold.h"
+#include "core/scratch.h"
 #include "core/trig.h"
+#include "tests/scarce.h"
 
 #define BEAMS  121
 #define ROWS   60
@@ -324,6 +326,40 @@ static void a_full_scratch_is_folded_and_nothing_is_lost(void **state)
 	assert_int_equal(stats.blocks, 2 * N);
 	assert_true(one > 0);
 	assert_int_equal(all, N * one);
+	fold_destroy(fold);
+	grid_destroy(rig.grid);
+}
+
+/* A block's columns along several axes are gathered in one; where there is no memory for that, they are lost, and none of them
+ * is left for a later row. */
+static void without_memory_no_column_is_left_for_later_rows(void **state)
+{
+	struct rig rig = {.grid = grid_create(MEMORY)};
+	struct fold *fold = fold_create(rig.grid);
+	struct fold_plane flat = fold_plane((struct vec3){0, 0, 1}, 32), wall = fold_plane((struct vec3){1, 0, 0}, 32);
+	uint64_t weight[3] = {0};
+
+	(void)state;
+	if (!SCARCE_WORKS)
+		skip();
+	for (int n = 0; n < 5 * 5; n++) /* all the blocks */
+		fold_sample(fold, &flat, (struct vec3){8 * (n % 5), 8 * (n / 5), 3.5});
+	fold_apply(fold);
+	fold_sample(fold, &wall, (struct vec3){3.5, 4, 4});
+	fold_sample(fold, &flat, (struct vec3){2, 2, 3.5});
+	for (int n = 0; n < SLAB_COLUMNS - COLUMNS_AT_HAND - 1; n++) /* one more than leaves enough to gather */
+		fold_sample(fold, &flat, (struct vec3){8 + n % 31, n / 31, 3.5});
+	scarce_left = 0;
+	fold_apply(fold);
+	assert_int_equal(scarce_left, -1); /* it ran out */
+	grid_each(rig.grid, weights_add, &weight[0]);
+	for (int row = 1; row < 3; row++) {
+		fold_sample(fold, &flat, (struct vec3){5, 5, 3.5});
+		fold_apply(fold);
+		grid_each(rig.grid, weights_add, &weight[row]);
+	}
+	assert_true(weight[1] > weight[0]);
+	assert_int_equal(weight[1] - weight[0], weight[2] - weight[1]);
 	fold_destroy(fold);
 	grid_destroy(rig.grid);
 }
@@ -689,6 +725,7 @@ int main(void)
 	    cmocka_unit_test(at_the_cap_sum_and_weight_shrink_together),
 	    cmocka_unit_test(a_crowd_of_points_in_one_place_does_not_overflow),
 	    cmocka_unit_test(a_full_scratch_is_folded_and_nothing_is_lost),
+	    cmocka_unit_test(without_memory_no_column_is_left_for_later_rows),
 	    cmocka_unit_test(a_patch_is_the_sum_of_its_samples),
 	    cmocka_unit_test(a_row_that_waited_gives_the_same_voxels),
 	    cmocka_unit_test(lookahead_says_how_many_rows_wait),

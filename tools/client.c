@@ -6,20 +6,12 @@
 #include <stdio.h>
 #include <stdlib.h>
 #include <string.h>
-#include <time.h>
 
 #include "tools/libfacet.h"
 
 struct client {
 	struct facet *facet;
 };
-
-static int64_t now_ms(void)
-{
-	struct timespec t;
-	clock_gettime(CLOCK_MONOTONIC, &t);
-	return (int64_t)t.tv_sec * 1000 + t.tv_nsec / 1000000;
-}
 
 /* The sentence where there is one to give: `code`. */
 static int tell(const struct client *client, int code, char error[CLIENT_ERROR_MAX])
@@ -69,9 +61,9 @@ int client_want(struct client *client, const struct native_want *want, char erro
 /* The next event of a kind: 1, 0: time is over, -errno. */
 static int wait_for(struct client *client, enum facet_kind kind, int timeout_ms, struct facet_event *ret)
 {
-	const int64_t until_ms = now_ms() + timeout_ms;
+	const int64_t until_ms = libfacet_now_ms() + timeout_ms;
 	for (;;) {
-		const int64_t left = until_ms - now_ms();
+		const int64_t left = until_ms - libfacet_now_ms();
 		const int r = facet_wait(client->facet, left > 0 ? (int)left : 0, ret);
 		if (r <= 0 || ret->kind == kind)
 			return r;

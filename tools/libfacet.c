@@ -15,7 +15,6 @@
 #include <string.h>
 #include <sys/random.h>
 #include <sys/socket.h>
-#include <time.h>
 #include <unistd.h>
 
 #include "config/address.h"
@@ -48,13 +47,6 @@ struct facet {
 	uint8_t *data;
 	size_t begin, end, cap; /* data[begin..end) is read, not yet handled */
 };
-
-static int64_t now_ms(void)
-{
-	struct timespec t;
-	clock_gettime(CLOCK_MONOTONIC, &t);
-	return (int64_t)t.tv_sec * 1000 + t.tv_nsec / 1000000;
-}
 
 static int fail(struct facet *facet, int code, const char *format, ...) __attribute__((format(printf, 3, 4)));
 
@@ -524,13 +516,13 @@ int facet_next(struct facet *facet, struct facet_event *ret)
 
 static int left_ms(int64_t until_ms)
 {
-	const int64_t left = until_ms - now_ms();
+	const int64_t left = until_ms - libfacet_now_ms();
 	return until_ms == INT64_MAX ? -1 : left > 0 ? (int)left : 0;
 }
 
 static int64_t deadline_ms(int timeout_ms)
 {
-	return timeout_ms < 0 ? INT64_MAX : now_ms() + timeout_ms;
+	return timeout_ms < 0 ? INT64_MAX : libfacet_now_ms() + timeout_ms;
 }
 
 int facet_wait(struct facet *facet, int timeout_ms, struct facet_event *ret)
@@ -558,7 +550,7 @@ int facet_follow(struct facet *facet, int timeout_ms, struct facet_event *ret)
 			if (r >= 0)
 				return r;
 			hang_up(facet);
-			facet->retry_ms = now_ms() + RETRY_MS;
+			facet->retry_ms = libfacet_now_ms() + RETRY_MS;
 			*ret = (struct facet_event){.kind = FACET_LOST};
 			return 1;
 		}
@@ -566,7 +558,7 @@ int facet_follow(struct facet *facet, int timeout_ms, struct facet_event *ret)
 		if (poll(NULL, 0, left_ms(next)) < 0 || (next == until_ms && left_ms(until_ms) == 0))
 			return 0;
 		if (facet_reopen(facet, ANSWER_MS))
-			facet->retry_ms = now_ms() + RETRY_MS;
+			facet->retry_ms = libfacet_now_ms() + RETRY_MS;
 	}
 }
 

@@ -10,6 +10,8 @@
 int libfacet_want(struct facet *, const struct native_want *);
 const struct native_mirror *libfacet_mirror(const struct facet *);
 
+int64_t libfacet_now_ms(void); /* on CLOCK_MONOTONIC */
+
 /* A connected descriptor that does not block, or -errno; waits at most `timeout_ms`. */
 struct address;
 int libfacet_connect(const struct address *, int timeout_ms);

@@ -63,7 +63,7 @@ int libfacet_connect(const struct address *address, int timeout_ms)
 	return fd;
 }
 
-static int64_t now_ms(void)
+int64_t libfacet_now_ms(void)
 {
 	struct timespec t;
 	clock_gettime(CLOCK_MONOTONIC, &t);
@@ -75,7 +75,7 @@ static ssize_t await_answer(int fd, const uint8_t key[16], int64_t until_ms, uin
                             size_t *len, char error[WEBSOCKET_ERROR_MAX])
 {
 	for (;;) {
-		const int64_t left = until_ms - now_ms();
+		const int64_t left = until_ms - libfacet_now_ms();
 		struct pollfd poll_fd = {.fd = fd, .events = POLLIN};
 		const int ready = poll(&poll_fd, 1, left > 0 ? (int)left : 0);
 		if (ready == 0)
@@ -97,7 +97,7 @@ static ssize_t await_answer(int fd, const uint8_t key[16], int64_t until_ms, uin
 int libfacet_upgrade(int fd, const struct address *address, int timeout_ms, struct buffer *ret_rest,
                      char error[FACET_ERROR_MAX])
 {
-	const int64_t until_ms = now_ms() + timeout_ms;
+	const int64_t until_ms = libfacet_now_ms() + timeout_ms;
 	char sentence[WEBSOCKET_ERROR_MAX] = "the request cannot be sent";
 	uint8_t key[16], got[WEBSOCKET_HEAD_MAX];
 	struct buffer request = {0};

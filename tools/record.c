@@ -15,12 +15,12 @@
 #include <stdlib.h>
 #include <string.h>
 #include <sys/socket.h>
-#include <time.h>
 #include <unistd.h>
 
 #include "config/address.h"
 #include "config/units.h"
 #include "tools/commands.h"
+#include "tools/libfacet.h"
 
 #define PIECE_MAX  (1u << 20)
 #define ANSWER_MAX (64u << 10)
@@ -81,14 +81,6 @@ static error_t parse_option(int key, char *arg, struct argp_state *state)
 	}
 }
 
-static int64_t now_ms(void)
-{
-	struct timespec t;
-
-	clock_gettime(CLOCK_MONOTONIC, &t);
-	return (int64_t)t.tv_sec * 1000 + t.tv_nsec / 1000000;
-}
-
 static int fail(struct recording *r, const char *who, const char *what)
 {
 	snprintf(r->error, sizeof(r->error), "%.200s: %.180s", who, what);
@@ -133,7 +125,7 @@ static void take(struct recording *r, size_t n)
 static int receive(struct recording *r, int64_t until_ms)
 {
 	struct pollfd fd = {.fd = r->socket, .events = POLLIN};
-	int64_t left_ms = until_ms - now_ms();
+	int64_t left_ms = until_ms - libfacet_now_ms();
 	ssize_t n;
 
 	if (poll(&fd, 1, left_ms > 0 ? (int)left_ms : 0) <= 0)
@@ -185,10 +177,10 @@ static int judge_line(struct recording *r, size_t end)
 
 static int await_answer(struct recording *r)
 {
-	const int64_t until_ms = now_ms() + SILENT_MS;
+	const int64_t until_ms = libfacet_now_ms() + SILENT_MS;
 	int got = 0;
 
-	while (got == 0 && now_ms() < until_ms && !interrupted) {
+	while (got == 0 && libfacet_now_ms() < until_ms && !interrupted) {
 		uint8_t *end = memchr(r->in, '\n', r->len);
 
 		if (end)
@@ -239,25 +231,25 @@ static int write_pieces(struct recording *r)
 
 static int run(struct recording *r)
 {
-	const int64_t end_ms = r->job->seconds > 0 ? now_ms() + (int64_t)(r->job->seconds * 1000) : INT64_MAX;
-	int64_t until_ms = now_ms() + SILENT_MS;
+	const int64_t end_ms = r->job->seconds > 0 ? libfacet_now_ms() + (int64_t)(r->job->seconds * 1000) : INT64_MAX;
+	int64_t until_ms = libfacet_now_ms() + SILENT_MS;
 
 	while (!r->ended) {
 		int got;
 
-		if (!r->asked && (interrupted || now_ms() >= end_ms)) {
+		if (!r->asked && (interrupted || libfacet_now_ms() >= end_ms)) {
 			r->asked = true;
-			until_ms = now_ms() + END_MS;
+			until_ms = libfacet_now_ms() + END_MS;
 			if (say(r, "?RECORD={\"enable\":false}\n") < 0)
 				return -1;
 		}
 		got = receive(r, r->asked || end_ms > until_ms ? until_ms : end_ms);
 		if (got < 0 || write_pieces(r) < 0)
 			return -1;
-		if (got == 0 && now_ms() >= until_ms)
+		if (got == 0 && libfacet_now_ms() >= until_ms)
 			return fail(r, "the daemon", "has sent nothing for 10 s; what came is in the file");
 		if (got == 1 && !r->asked)
-			until_ms = now_ms() + SILENT_MS;
+			until_ms = libfacet_now_ms() + SILENT_MS;
 	}
 	return 0;
 }

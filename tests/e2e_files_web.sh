@@ -28,10 +28,8 @@ beyond() { # WORD NUMBER
     [ "$(status "$1")" -gt "$2" ]
 }
 
-still() { # the queue is empty and nothing is applied any more
-    before=$(status step)
-    sleep 1
-    [ "$(status length)" -eq 0 ] && [ "$(status step)" -eq "$before" ]
+still() { # no row waits, and none is being worked on
+    curl -s "${url}status.json" | grep '"idle":true'
 }
 
 # A part of the demo building, then no more rows.

@@ -164,10 +164,9 @@ assert ask(lines, "?NONSENSE")["class"] == "ERROR"
 assert ask(lines, '?WATCH={"enable":false}') == {"class": "WATCH", "enable": False}
 status = ask(lines, "?STATUS;")
 assert status["paused"] is True
-before = None
-while before != (now := read_map()):
-    before = now
-    time.sleep(0.5)
+while not ask(lines, "?STATUS;")["queue"]["idle"]:
+    time.sleep(0.1)
+now = read_map()
 print("step %d, %d vertices, %d faces" % now)
 EOF
 python3 "$scratch/client.py" "${address#unix:}" >"$scratch/documented" || fail "a client written from docs/protocol.md"

@@ -73,7 +73,7 @@ function replayConfig() {
 let address;
 const startDaemon = async () => {
   const daemon = start('facetd', '--config', join(dir, 'facetd.yaml'));
-  await until('facetd listens', 30, () => status().catch(() => null));
+  await until('facetd listens', 60, () => status().catch(() => null));
   return daemon;
 };
 
@@ -82,20 +82,23 @@ async function standStill(patches) {
   await until(`a map of ${patches} patches`, 60, async () => (await status()).map_size.patches >= patches);
   assert.equal((await command('PAUSE')).class, 'OK');
   let before = null;
-  return until('the map stands', 20, async () => {
-    const now = await status(), same = before && before.step === now.step && before.map_size.triangles === now.map_size.triangles;
+  return until('the map stands', 60, async () => {
+    const now = await status(), same = now.queue.idle && before?.step === now.step && before.map_size.triangles === now.map_size.triangles;
     before = now;
     await sleep(300);
     return same && now;
   });
 }
 
-const holds = (page, what, { step, generation, map_size: map }) => page.until(what, 40,
-  `(({patches, triangles, drawn, step, generation}) => patches === ${map.patches} && triangles === ${map.triangles} &&
-    drawn === ${map.triangles} && step === ${step} && generation === ${generation})(viewer.counts())`);
+// Both are asked anew each time: what the daemon still works on when it is asked is no map that the page could have.
+const holds = (page, what) => until(what, 120, async () => {
+  const now = await status(), shown = await counts(page), { patches, triangles } = now.map_size;
+  return shown.patches === patches && shown.triangles === triangles && shown.drawn === triangles && shown.step === now.step &&
+    shown.generation === now.generation;
+});
 
 // The camera glides; it stands when three pictures in a row are seen from the same place.
-const standing = (page) => page.until('the camera stands', 40, `new Promise((done) => {
+const standing = (page) => page.until('the camera stands', 200, `new Promise((done) => {
   const at = () => viewer.camera.current.matrixWorld.elements.join() + viewer.camera.current.projectionMatrix.elements.join();
   const before = at();
   let frames = 0;
@@ -112,7 +115,7 @@ const claims = {
     const page = await browser.open('about:blank');
     await page.call('Network.enable');
     await page.call('Page.navigate', { url: address });
-    await page.until('the page runs', 30, 'viewer.counts().patches > 0');
+    await page.until('the page runs', 60, 'viewer.counts().patches > 0');
     browser.heard = null;
     await page.close();
     assert.ok(asked.length >= 3);
@@ -131,17 +134,18 @@ const claims = {
   async 'it shows the robot, the angle of its servo, its laser and its trail'({ page }) {
     await page.until('the robot', 60, 'viewer.robot.body.visible && viewer.live.scanners().length === 1');
     await page.until('a profile', 60, `viewer.live.scanners()[0].scan?.ranges.length > 100 && [...viewer.robot.heads.values()].some(({ fan }) => fan.visible)`);
-    await page.until('the angle', 20, `/^-?\\d+\\.\\d°$/.test(document.getElementById('servo-angle').textContent)`);
+    await page.until('the angle', 60, `/^-?\\d+\\.\\d°$/.test(document.getElementById('servo-angle').textContent)`);
     await page.until('the trail', 60, 'viewer.robot.trail.n > 5');
     const names = await page.ask(`document.getElementById('devices').innerText`);
     for (const name of ['laser', 'servo', 'pose']) assert.ok(names.includes(name), names);
   },
 
   async 'it shows the map: as many patches and triangles as the daemon says'({ page }) {
-    await holds(page, 'the page has the map', await standStill(PATCHES));
+    await standStill(PATCHES);
+    await holds(page, 'the page has the map');
     const { patches, triangles } = await counts(page);
         console.log(`note: ${patches} patches, ${triangles} triangles`);
-    await page.until('the panel says so', 10, `document.getElementById('state-text').textContent === 'paused' &&
+    await page.until('the panel says so', 60, `document.getElementById('state-text').textContent === 'paused' &&
       document.getElementById('patches').textContent.length > 0`);
   },
 
@@ -170,9 +174,9 @@ const claims = {
   async 'a click tells point, class, plane and patch'({ page }) {
     await page.ask(`viewer.camera.home()`);
     await standing(page);
-    const { x, y } = await page.until('a place to click', 20, `viewer.somewhere()`);
+    const { x, y } = await page.until('a place to click', 60, `viewer.somewhere()`);
     await page.click(x, y);
-    await page.until('the pick', 10, `!document.getElementById('pick').hidden`);
+    await page.until('the pick', 60, `!document.getElementById('pick').hidden`);
     const text = await page.ask(`document.getElementById('pick-text').innerText`);
     for (const word of ['Point', 'Class', 'unknown', 'Plane', 'Normal', 'Patch', 'triangles']) assert.ok(text.includes(word), text);
     await page.click(...(await page.ask(`(r => [r.x + r.width / 2, r.y + r.height / 2])(document.getElementById('pick-close').getBoundingClientRect())`)));
@@ -182,12 +186,12 @@ const claims = {
   async 'two clicks measure what lies between them'({ page }) {
     await page.ask(`document.querySelector('[data-camera=top]').click(); viewer.camera.home(); document.getElementById('measure').click()`);
     await standing(page);
-    const { x, y } = await page.until('a floor to click', 20, `viewer.somewhere(0.95)`);
+    const { x, y } = await page.until('a floor to click', 60, `viewer.somewhere(0.95)`);
     await page.click(x, y);
-    await page.until('the first point', 10, `viewer.measure.points.length === 1`);
-    const other = await page.until('another place', 20, `viewer.somewhere(0.95, 60)`);
+    await page.until('the first point', 60, `viewer.measure.points.length === 1`);
+    const other = await page.until('another place', 60, `viewer.somewhere(0.95, 60)`);
     await page.click(other.x, other.y);
-    await page.until('a length', 10, `!document.getElementById('length').hidden`);
+    await page.until('a length', 60, `!document.getElementById('length').hidden`);
     const { level } = await page.ask(`viewer.measure.result`);
     const wanted = Math.hypot(other.x - x, other.y - y) * (await page.ask(`viewer.camera.metresPerPixel(innerHeight)`));
     assert.ok(Math.abs(level - wanted) < 0.02 + 0.002 * wanted, `${level} m measured, ${wanted} m by the scale of the plan`);
@@ -202,13 +206,13 @@ const claims = {
     const shot = async () => (await page.call('Page.captureScreenshot', { format: 'png', clip })).data;
     const slide = (value) => page.ask(`(s => { s.value = ${value}; s.dispatchEvent(new Event('input')); })(document.getElementById('section'))`);
     await standing(page);
-    await until('one picture', 20, async () => (await shot()) === (await shot()));
+    await until('one picture', 60, async () => (await shot()) === (await shot()));
     const whole = await shot();
     await slide(450);
-    await until('pixels change', 20, async () => (await shot()) !== whole);
+    await until('pixels change', 60, async () => (await shot()) !== whole);
     assert.match(await page.ask(`document.getElementById('section-at').textContent`), /m$/);
     await slide(1000);
-    await until('all is there again', 20, async () => (await shot()) === whole);
+    await until('all is there again', 60, async () => (await shot()) === whole);
     await page.ask(`for (const id of ['laser', 'robot', 'trail', 'backs']) document.getElementById(id).click()`);
   },
 
@@ -219,17 +223,17 @@ const claims = {
 
   async 'who shows the token may pause and record'({ browser }) {
     const page = await browser.open(`${address}#token=${encodeURIComponent(TOKEN)}`, 640, 400);
-    await page.until('the buttons', 30, `document.getElementById('changes').offsetParent !== null`);
+    await page.until('the buttons', 60, `document.getElementById('changes').offsetParent !== null`);
     assert.equal(await page.ask('location.hash'), '', 'it is out of the address bar');
     await page.ask(`document.getElementById('pause').click()`);
-    await until('it goes on', 20, async () => !(await status()).paused);
-    await page.until('the button says so', 10, `document.getElementById('pause').getAttribute('aria-pressed') === 'false'`);
+    await until('it goes on', 60, async () => !(await status()).paused);
+    await page.until('the button says so', 60, `document.getElementById('pause').getAttribute('aria-pressed') === 'false'`);
     await page.ask(`document.getElementById('pause').click()`);
-    await until('it pauses', 20, async () => (await status()).paused);
+    await until('it pauses', 60, async () => (await status()).paused);
     for (const wanted of [false, true]) { // `record.dir` is set: it records from the start
       await page.ask(`document.getElementById('record').click()`);
-      await until(wanted ? 'it records' : 'it ends', 20, async () => (await status()).record.recording === wanted);
-      await page.until('the button says so', 10, `document.getElementById('record').getAttribute('aria-pressed') === '${wanted}'`);
+      await until(wanted ? 'it records' : 'it ends', 60, async () => (await status()).record.recording === wanted);
+      await page.until('the button says so', 60, `document.getElementById('record').getAttribute('aria-pressed') === '${wanted}'`);
     }
     await page.close();
     await standStill(1);
@@ -237,10 +241,10 @@ const claims = {
 
   async 'a wrong token is asked for again, and not tried over and over'({ browser }) {
     const page = await browser.open(`${address}#token=wrong-wrong-wrong-wrong`, 640, 400);
-    await page.until('it asks', 30, `!document.getElementById('ask').hidden`);
+    await page.until('it asks', 60, `!document.getElementById('ask').hidden`);
     await sleep(3000);
     await page.ask(`document.getElementById('token').value = ${JSON.stringify(TOKEN)}; document.getElementById('ask').requestSubmit()`);
-    await page.until('the right one opens', 30, `viewer.counts().patches > 0 && document.getElementById('ask').hidden`);
+    await page.until('the right one opens', 60, `viewer.counts().patches > 0 && document.getElementById('ask').hidden`);
     await page.close();
   },
 
@@ -256,7 +260,7 @@ const claims = {
 
   async 'on a phone all is there, and large enough for a finger'({ browser }) {
     const page = await browser.open(address, 360, 640, true);
-    await page.until('the map', 40, 'viewer.map.drawn > 0');
+    await page.until('the map', 60, 'viewer.map.drawn > 0');
     const small = await page.ask(`[...document.querySelectorAll('button')].filter((b) => b.getClientRects().length && getComputedStyle(b).visibility === 'visible')
       .map((b) => [b.id || b.dataset.camera, b.getBoundingClientRect()]).filter(([, r]) => r.width < 40 || r.height < 40 || r.left < 0 || r.right > 360)
       .map(([id, r]) => id + ' ' + r.width + 'x' + r.height + ' at ' + r.left)`);
@@ -265,51 +269,52 @@ const claims = {
     const hidden = `getComputedStyle(document.getElementById('panel')).visibility === 'hidden'`;
     assert.ok(await page.ask(hidden), 'the panel begins collapsed');
     await page.tap(338, 34);
-    await page.until('the panel opens', 10, `!(${hidden})`);
+    await page.until('the panel opens', 60, `!(${hidden})`);
     await page.tap(180, 60);
-    await page.until('the panel closes', 10, hidden);
+    await page.until('the panel closes', 60, hidden);
     const before = await page.ask('viewer.camera.free.position.toArray()');
     await page.drag(180, 300, 90, 20);
-    await page.until('a finger turns the view', 20, `Math.hypot(...viewer.camera.free.position.toArray().map((v, i) => v - ${JSON.stringify(before)}[i])) > 0.5`);
+    await page.until('a finger turns the view', 60, `Math.hypot(...viewer.camera.free.position.toArray().map((v, i) => v - ${JSON.stringify(before)}[i])) > 0.5`);
     await page.close();
   },
 
   async 'it survives a restart of the daemon, and says how old the picture is meanwhile'(bed) {
     const { page } = bed;
-    await holds(page, 'the page has the map', await status());
+    await holds(page, 'the page has the map');
     const before = await counts(page);
     await end(bed.daemon);
-    await page.until('the page says that the daemon is gone', 20, `/reconnecting, picture is/.test(document.getElementById('state-text').textContent)`);
+    await page.until('the page says that the daemon is gone', 60, `/reconnecting, picture is/.test(document.getElementById('state-text').textContent)`);
     const meanwhile = await counts(page);
     assert.deepEqual([meanwhile.patches, meanwhile.drawn], [before.patches, before.drawn], 'the picture stays');
     await sleep(2500);
     bed.daemon = await startDaemon();
-    await page.until('it is back', 20, `viewer.counts().map !== ${JSON.stringify(before.map)}`);
-    await holds(page, 'the page has the new map', await standStill(60));
-    await page.until('the panel says so', 10, `document.getElementById('state-text').textContent === 'paused'`);
+    await page.until('it is back', 60, `viewer.counts().map !== ${JSON.stringify(before.map)}`);
+    await standStill(60);
+    await holds(page, 'the page has the new map');
+    await page.until('the panel says so', 60, `document.getElementById('state-text').textContent === 'paused'`);
   },
 
   async 'a replay has a transport: pause, seek, speed'(bed) {
     await end(bed.daemon);
     const file = readdirSync(dir).filter((name) => name.endsWith('.mcap')).sort()[0];
     bed.daemon = start('facetd', '--config', replayConfig(), '--replay', join(dir, file));
-    await until('facetd replays', 30, async () => (await status().catch(() => null))?.replay);
+    await until('facetd replays', 60, async () => (await status().catch(() => null))?.replay);
     const page = await bed.browser.open(address, 900, 500);
-    await page.until('the transport', 40, `!document.getElementById('transport').hidden && !document.getElementById('play').disabled`);
+    await page.until('the transport', 60, `!document.getElementById('transport').hidden && !document.getElementById('play').disabled`);
     await page.ask(`document.getElementById('play').click()`);
-    await until('it stops', 20, async () => (await status()).replay.state === 'paused');
+    await until('it stops', 60, async () => (await status()).replay.state === 'paused');
     await page.ask(`(s => { s.value = 'max'; s.dispatchEvent(new Event('change')); })(document.getElementById('speed'))`);
-    await until('its speed is max', 20, async () => (await status()).replay.speed === 'max');
+    await until('its speed is max', 60, async () => (await status()).replay.speed === 'max');
     await page.ask(`(s => { s.value = 200; s.dispatchEvent(new Event('input')); s.dispatchEvent(new Event('change')); })(document.getElementById('seek'))`);
-    await until('it is there', 30, async () => {
+    await until('it is there', 60, async () => {
       const { replay } = await status();
       return replay.state === 'paused' && Math.abs(replay.position - replay.begin - 0.2 * (replay.end - replay.begin)) < 0.5;
     });
-    await page.until('the page has that map', 40, `viewer.counts().step === ${(await status()).step} && viewer.counts().drawn === ${(await status()).map_size.triangles}`);
-    await page.until('the page says that it is paused', 20, `viewer.status().replay.state === 'paused'`);
+    await holds(page, 'the page has that map');
+    await page.until('the page says that it is paused', 60, `viewer.status().replay.state === 'paused'`);
     await page.ask(`document.getElementById('play').click()`);
     await until('it plays to the end', 120, async () => (await status()).replay.state === 'ended');
-    await holds(page, 'the page has the whole map', await status());
+    await holds(page, 'the page has the whole map');
     await page.close();
     await end(bed.daemon);
   },
@@ -321,7 +326,7 @@ async function main() {
   const devices = start('facet', 'simulate', 'building', '--endless', '--dir', dir, '--http', `127.0.0.1:${port}`);
   let failures = 0;
   try {
-    await until('simulated devices', 30, () => existsSync(join(dir, 'facetd.yaml')));
+    await until('simulated devices', 60, () => existsSync(join(dir, 'facetd.yaml')));
     grantToken();
     bed.daemon = await startDaemon();
     bed.browser = new Browser();

@@ -52,12 +52,12 @@ static int remove_dir(void **state)
 	return rmdir(dir);
 }
 
-/* Waits at most 20 s for what the link says next: bytes, or -errno. */
+/* Waits at most two minutes for what the link says next: bytes, or -errno. */
 static ssize_t await(struct link *link, uint8_t *buf, size_t cap, int64_t *t_ns)
 {
 	struct pollfd p = {.fd = driver_modbus.link_fd(link), .events = POLLIN};
 
-	assert_int_equal(poll(&p, 1, 20000), 1);
+	assert_int_equal(poll(&p, 1, 120000), 1);
 	*t_ns = now_ns();
 	return driver_modbus.link_read(link, buf, cap, t_ns);
 }

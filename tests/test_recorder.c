@@ -252,7 +252,7 @@ static void the_oldest_recordings_go_beyond_keep_and_nothing_else_does(void **st
 
 static bool expect_notice(struct recorder *r, const char *wanted, struct recorder_notice *ret)
 {
-	for (int i = 0; i < 2000; i++) {
+	for (int i = 0; i < 12000; i++) {
 		while (recorder_notice(r, ret))
 			if (strcmp(ret->state, wanted) == 0)
 				return true;

@@ -19,6 +19,7 @@
 #include <unistd.h>
 
 #include <cmocka.h>
+#include <jansson.h>
 
 #include "core/map.h"
 #include "core/model.h"
@@ -118,7 +119,7 @@ static const char *build_directory(void)
 	return build && *build ? build : "build";
 }
 
-enum { ARGUMENTS_MAX = 24, FIRST_MAP = 1 /* generation */ };
+enum { ARGUMENTS_MAX = 24, FIRST_MAP = 1 /* generation */, PATIENCE_MS = 120000 };
 
 struct live {
 	char dir[32], address[64], config[64], journal[64];
@@ -162,7 +163,7 @@ static struct client *open_client(const char *address)
 	char error[CLIENT_ERROR_MAX] = "";
 	struct client *client = NULL;
 
-	for (int i = 0; i < 300 && !client; i++, nap())
+	for (int i = 0; i < 1200 && !client; i++, nap())
 		client = client_open(address, 2000, error);
 	if (!client)
 		fail_msg("%s", error);
@@ -212,11 +213,32 @@ static void command(const struct live *live, const char *command)
 	const char *line = NULL;
 
 	assert_int_equal(client_say(client, command, error), 0);
-	while (client_line(client, 5000, &line, error) == 1 && !strstr(line, "\"OK\""))
+	while (client_line(client, PATIENCE_MS, &line, error) == 1 && !strstr(line, "\"OK\""))
 		;
 	assert_non_null(line);
 	assert_non_null(strstr(line, "\"OK\""));
 	client_close(client);
+}
+
+/* The step that the map stands at, or 0 where a row still waits or is being worked on. */
+static uint64_t stands_at(const struct live *live)
+{
+	struct client *client = open_client(live->address);
+	char error[CLIENT_ERROR_MAX] = "";
+	const char *line = NULL;
+	uint64_t step = 0;
+
+	assert_int_equal(client_say(client, "?STATUS", error), 0);
+	while (client_line(client, PATIENCE_MS, &line, error) == 1 && !strstr(line, "\"STATUS\""))
+		;
+	assert_non_null(line);
+	json_t *status = json_loads(line, 0, NULL);
+	assert_non_null(status);
+	if (json_is_true(json_object_get(json_object_get(status, "queue"), "idle")))
+		step = (uint64_t)json_integer_value(json_object_get(status, "step"));
+	json_decref(status);
+	client_close(client);
+	return step;
 }
 
 static uint32_t generation(const struct live *live)
@@ -232,7 +254,7 @@ static void follow(const struct live *live, uint32_t wanted, uint64_t rows)
 	char error[CLIENT_ERROR_MAX] = "";
 	uint64_t step = 0;
 
-	for (int i = 0; i < 1200 && step < rows; i++) {
+	for (int i = 0; i < 6000 && step < rows; i++) {
 		int r = client_commit(live->client, 100, error);
 
 		if (r < 0)
@@ -242,20 +264,21 @@ static void follow(const struct live *live, uint32_t wanted, uint64_t rows)
 	assert_true(step >= rows);
 }
 
-/* No row is taken any more; the map stands once what waited in the queue is in it. */
+/* No row is taken any more; the map stands once what waited in the queue is in it, and the client follows. */
 static void pause_and_settle(const struct live *live)
 {
 	char error[CLIENT_ERROR_MAX] = "";
-	int quiet = 0;
+	uint64_t step = 0;
 
 	command(live, "?PAUSE");
-	for (int i = 0; i < 600 && quiet < 20; i++) {
-		int r = client_commit(live->client, 100, error);
-
-		assert_true(r >= 0);
-		quiet = r == 1 ? 0 : quiet + 1;
+	for (int i = 0; i < PATIENCE_MS / 100 && step == 0; i++) {
+		step = stands_at(live);
+		assert_true(client_commit(live->client, 100, error) >= 0);
 	}
-	assert_int_equal(quiet, 20);
+	assert_true(step > 0);
+	for (int i = 0; i < PATIENCE_MS / 100 && native_mirror_step(client_mirror(live->client)) != step; i++)
+		assert_true(client_commit(live->client, 100, error) >= 0);
+	assert_int_equal(native_mirror_step(client_mirror(live->client)), step);
 }
 
 /* A map, as a client holds it or a fed list gives it. */

@@ -1,6 +1,7 @@
 /* Law: what is wrong with a port is one sentence that names it and says what to do; a line is raw, and its rate is read back. */
 #include <errno.h>
 #include <fcntl.h>
+#include <poll.h>
 #include <setjmp.h>
 #include <stdarg.h>
 #include <stddef.h>
@@ -101,7 +102,7 @@ static void a_line_is_raw_empty_and_has_the_rate_asked_for(void **state)
 	cfmakeraw(&t); /* as a simulator does: a fresh one echoes */
 	assert_int_equal(tcsetattr(early, TCSANOW, &t), 0);
 	assert_int_equal(write(master, "left over\n", 10), 10);
-	usleep(20000);
+	assert_int_equal(poll(&(struct pollfd){.fd = early, .events = POLLIN}, 1, 120000), 1);
 	const int fd = serial_open(path, error);
 	assert_true(fd >= 0);
 	assert_int_equal(read(fd, &byte, 1), -1);

@@ -22,7 +22,7 @@
 #include "tools/sim_can.h"
 #include "tools/sim_can_bus.h"
 
-#define PATIENCE_NS 30000000000ll
+#define PATIENCE_NS 120000000000ll
 #define MS          1000000ll
 #define DEG         TRIG_DEG
 

@@ -16,7 +16,7 @@
 
 #include "tools/sim_control.h"
 
-#define PATIENCE_NS 30000000000ll
+#define PATIENCE_NS 120000000000ll
 
 struct bench {
 	uv_loop_t loop;

@@ -18,7 +18,7 @@
 #include "drivers/serial.h"
 #include "tools/sim_device.h"
 
-#define PATIENCE_NS 60000000000ll
+#define PATIENCE_NS 240000000000ll
 
 struct rig {
 	char dir[32], port[64];

@@ -61,7 +61,7 @@ static modbus_t *client(const char *path)
 	modbus_t *modbus = modbus_new_rtu(path, 115200, 'N', 8, 1);
 
 	modbus_set_slave(modbus, 3);
-	modbus_set_response_timeout(modbus, 10, 0);
+	modbus_set_response_timeout(modbus, 60, 0);
 	assert_int_equal(modbus_connect(modbus), 0);
 	return modbus;
 }
@@ -106,7 +106,7 @@ static void a_new_target_on_the_way_turns_it_where_it_is(void **state)
 	modbus_t *modbus = client(rtu);
 	uint16_t up[2] = {0, 40000}, down[2] = {0xffff, 0x63c0}; /* 40 and -40 degrees at 30 degrees a second */
 	double there;
-	int64_t t_ns;
+	int64_t begin_ns = now_ns(), t_ns;
 
 	(void)state;
 	modbus_write_registers(modbus, SIM_SERVO_TARGET, 2, up);
@@ -114,11 +114,11 @@ static void a_new_target_on_the_way_turns_it_where_it_is(void **state)
 	modbus_write_registers(modbus, SIM_SERVO_TARGET, 2, down);
 	t_ns = now_ns();
 	there = sim_servo_angle(servo, t_ns);
-	assert_true(there < 40.0 * DEG);
+	assert_true(there <= 40.0 * DEG);
 	/* the past stays as it was: it was never higher than where it could have come, and it did rise */
 	double peak = 0.0, last = 0.0;
 
-	for (int64_t t = t_ns - SECOND; t <= t_ns; t += 100000) {
+	for (int64_t t = begin_ns; t <= t_ns; t += 100000) {
 		double angle = sim_servo_angle(servo, t);
 
 		assert_true(fabs(angle - last) < 30.0 * DEG * 1e-4 + 1e-12);
@@ -126,7 +126,7 @@ static void a_new_target_on_the_way_turns_it_where_it_is(void **state)
 		last = angle;
 	}
 	assert_true(peak >= 30.0 * 0.05 * DEG - 1e-9);
-	assert_true(fabs(sim_servo_angle(servo, t_ns + SECOND) - (there - 30.0 * DEG)) < 1e-9);
+	assert_true(fabs(sim_servo_angle(servo, t_ns + SECOND) - fmax(there - 30.0 * DEG, -40.0 * DEG)) < 1e-9);
 	assert_true(fabs(sim_servo_angle(servo, t_ns + 20 * SECOND) + 40.0 * DEG) < 1e-9);
 	modbus_close(modbus);
 	modbus_free(modbus);
@@ -181,11 +181,14 @@ static void requests_for_others_and_garbage_get_no_answer_and_do_no_harm(void **
 	assert_int_equal(modbus_read_registers(modbus, 0, 2, r), -1);
 	assert_int_equal(errno, ETIMEDOUT);
 	assert_int_equal(write(modbus_get_socket(modbus), garbage, sizeof garbage), sizeof garbage);
+	/* Where nobody took the garbage so far, the next request is a part of it. */
 	usleep(50000);
 	modbus_set_slave(modbus, 3);
-	modbus_set_response_timeout(modbus, 10, 0);
-	assert_int_equal(modbus_read_registers(modbus, 100, 2, r), -1);
+	modbus_set_response_timeout(modbus, 1, 0);
+	for (int i = 0; i < 60 && (errno = 0, modbus_read_registers(modbus, 100, 2, r)) == -1 && errno == ETIMEDOUT;)
+		i++;
 	assert_int_equal(errno, EMBXILADD);
+	modbus_set_response_timeout(modbus, 60, 0);
 	assert_int_equal(position_of(modbus), 0);
 	modbus_close(modbus);
 	modbus_free(modbus);
@@ -204,7 +207,7 @@ static void several_clients_are_served_over_tcp(void **state)
 	for (int i = 0; i < 6; i++) {
 		modbus[i] = modbus_new_tcp("127.0.0.1", sim_servo_port(servo));
 		modbus_set_slave(modbus[i], 3);
-		modbus_set_response_timeout(modbus[i], 10, 0);
+		modbus_set_response_timeout(modbus[i], 60, 0);
 		assert_int_equal(modbus_connect(modbus[i]), 0);
 	}
 	for (int i = 0; i < 6; i++)
@@ -243,7 +246,8 @@ static void an_independent_master_reads_it(void **state)
 		skip();
 	}
 	servo = create(&params);
-	snprintf(command, sizeof command, "timeout 20 mbpoll -q -1 -B -0 -a 3 -r 0 -c 1 -t 4:int -p %d 127.0.0.1 2>&1",
+	snprintf(command, sizeof command,
+	         "timeout 120 mbpoll -o 10 -q -1 -B -0 -a 3 -r 0 -c 1 -t 4:int -p %d 127.0.0.1 2>&1",
 	         sim_servo_port(servo));
 	pipe = popen(command, "r");
 	assert_non_null(pipe);
@@ -286,7 +290,7 @@ static void it_is_silent_busy_and_late_when_that_was_ordered(void **state)
 	assert_int_equal(modbus_read_registers(modbus, 0, 2, r), -1);
 	assert_int_equal(errno, ETIMEDOUT);
 	order(servo, "silence", 0, SECOND, false);
-	modbus_set_response_timeout(modbus, 10, 0);
+	modbus_set_response_timeout(modbus, 60, 0);
 	assert_int_equal(position_of(modbus), 0);
 	modbus_close(modbus);
 	modbus_free(modbus);

@@ -17,7 +17,7 @@
 
 #include "tools/sim_device.h"
 
-#define PATIENCE_NS 30000000000ll
+#define PATIENCE_NS 120000000000ll
 #define QUIET_NS    400000000ll /* nothing happens for so long: then it does not happen */
 #define S           1000000000ll
 
@@ -134,8 +134,11 @@ static ssize_t after_quiet(struct bench *b, int i)
 {
 	int64_t end_ns = (int64_t)uv_hrtime() + QUIET_NS;
 	ssize_t n = -EAGAIN;
-	while ((int64_t)uv_hrtime() < end_ns && (n = hear(b, i)) != 0 && (n > 0 || n == -EAGAIN))
+	while ((int64_t)uv_hrtime() < end_ns && (n = hear(b, i)) != 0 && (n > 0 || n == -EAGAIN)) {
+		if (n > 0)
+			end_ns = (int64_t)uv_hrtime() + QUIET_NS;
 		turn(b);
+	}
 	return n;
 }
 

@@ -5,6 +5,9 @@ import { OrbitControls } from 'three/examples/jsm/controls/OrbitControls.js';
 
 const VIEW = new Vector3(-0.62, -0.85, 0.98).normalize(); // from the south-west, above
 const EASE_S = 0.25, MARGIN = 0.1;
+const THERE_M = 0.001; // nobody sees a glide's last millimetre, and each of its pictures would be made
+
+const glide = (from, to, share) => from.lerp(to, from.distanceTo(to) < THERE_M ? 1 : share);
 
 export class Camera {
   constructor(element, still) {
@@ -88,15 +91,15 @@ export class Camera {
       const size = bounds.getSize(new Vector3());
       const spread = 1.12 * Math.max(4, this.ratio > 1 ? Math.max(size.y, size.x / this.ratio)
         : Math.max(size.x, size.y * this.ratio));
-      this.spread += (spread - this.spread) * share;
+      this.spread += (spread - this.spread) * (Math.abs(spread - this.spread) < THERE_M ? 1 : share);
       this.frameTop();
-      this.plan.target.lerp(centre, share);
+      glide(this.plan.target, centre, share);
       this.top.position.copy(this.plan.target).setZ(bounds.max.z + 100);
       return;
     }
     const { eye, target } = this.standFor(points, centre);
-    this.turn.target.lerp(target, share);
-    this.free.position.lerp(eye, share);
+    glide(this.turn.target, target, share);
+    glide(this.free.position, eye, share);
   }
 
   // The nearest place from which all points are in sight along VIEW: each says how far aside the eye may be, by its depth.

@@ -6,7 +6,7 @@ if ! command -v python3 >/dev/null 2>&1; then
     echo "python3 is not here: install it (make deps)"
     exit 77
 fi
-timeout -k 5 120 python3 - "$build" "$scratch" <<'END'
+timeout -k 5 600 python3 - "$build" "$scratch" <<'END'
 import json, os, signal, socket, sys, time
 
 build, scratch = sys.argv[1:]
@@ -41,7 +41,7 @@ def start(natives, sockets, log, http=""):
             os.dup2(fd, 3 + i, inheritable=True)
         os.environ.update(LISTEN_FDS=str(len(sockets)), LISTEN_PID=str(os.getpid()))
         os.execv(build + "/facetd", ["facetd", "--config", config])
-    until = time.time() + 20
+    until = time.time() + 120
     while time.time() < until and open(log).read().count("listens on") < len(natives) + bool(http):
         time.sleep(0.05)
     return pid
@@ -49,7 +49,7 @@ def start(natives, sockets, log, http=""):
 
 def ask(family, address):
     s = socket.socket(family)
-    s.settimeout(20)
+    s.settimeout(120)
     s.connect(address)
     s.sendall(b"?STATUS\n")
     answer = s.makefile().readline()
@@ -75,7 +75,7 @@ early.sendall(b"?STATUS\n")
 for _ in range(2):
     pid = start(natives, [door, tcp], scratch + "/log")
     if early:
-        early.settimeout(20)
+        early.settimeout(120)
         assert '"class"' in early.makefile().readline()
         early = None
     ask(socket.AF_UNIX, path)
@@ -119,7 +119,7 @@ for _ in range(2):
     if "this build has no HTTP" in open(scratch + "/log").read():
         break
     waits = waits or socket.create_connection(page.getsockname())
-    waits.settimeout(20)
+    waits.settimeout(120)
     waits.sendall(b"GET /status.json HTTP/1.1\r\nHost: " + at.encode() + b"\r\n\r\n")
     assert waits.recv(12) == b"HTTP/1.1 200", "the page's socket is not served"
     waits = None

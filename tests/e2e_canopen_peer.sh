@@ -18,4 +18,4 @@ if ! [ -e "$modules/node_modules/canopen/index.js" ]; then
         exit 77
     }
 fi
-NODE_PATH=$modules/node_modules timeout 90 node tests/canopen_peer.js "$build/tests/canopen_node"
+NODE_PATH=$modules/node_modules timeout 600 node tests/canopen_peer.js "$build/tests/canopen_node"

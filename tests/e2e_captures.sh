@@ -7,7 +7,7 @@ captures=../shared/data/captures
 command -v python3 >/dev/null 2>&1 || { echo "python3 is not here: install it (make deps)"; exit 77; }
 
 counts() { # NAME VALUE...: the scanner's counters have them; else says which do not
-    timeout 20 "$facet" watch --once --json "unix:$scratch/facetd.sock" 2>/dev/null | python3 -c '
+    timeout 120 "$facet" watch --once --json "unix:$scratch/facetd.sock" 2>/dev/null | python3 -c '
 import json, sys
 devices = {device["name"]: device for device in json.loads(sys.stdin.readline())["devices"]}
 counters, wanted = devices["laser"]["counters"], sys.argv[1:]

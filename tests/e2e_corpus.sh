@@ -22,7 +22,7 @@ for source in tests/fuzz_*.c; do
     [ -n "$files" ] || { fail "$target is not in tests/fuzz_table: say which files it guards"; continue; }
     corpus=tests/corpus/${target#fuzz_}
     [ -n "$(ls "$corpus" 2>/dev/null)" ] || { fail "$target has no corpus in $corpus"; continue; }
-    if ! LLVM_PROFILE_FILE="$scratch/$target.raw" timeout -k 5 120 "$build/tests/$target" -runs=0 -timeout=20 "$corpus" >"$scratch/log" 2>&1; then
+    if ! LLVM_PROFILE_FILE="$scratch/$target.raw" timeout -k 5 800 "$build/tests/$target" -runs=0 -timeout=200 "$corpus" >"$scratch/log" 2>&1; then
         grep -E 'ERROR|SUMMARY|runtime error' "$scratch/log" | head -n 5
         fail "$target finds something in its own corpus"
         continue

@@ -33,7 +33,7 @@ still() { # no row waits, and none is being worked on
 }
 
 # A part of the demo building, then no more rows.
-"$facet" simulate building --dir "$scratch/robot" -- sleep 300 >/dev/null 2>&1 &
+"$facet" simulate building --endless --dir "$scratch/robot" -- sleep 3000 >/dev/null 2>&1 &
 until_true 30 test -s "$scratch/robot/facetd.yaml" || exit 1
 token=0123456789abcdef0123456789abcdef
 (umask 077 && echo $token >"$scratch/token")

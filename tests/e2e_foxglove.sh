@@ -6,4 +6,4 @@ tests=$(dirname "$0")
 unset FACETD FACETD_CONFIG
 
 modules=$("$tests/npm/install" "$build") || { echo "$modules"; exit 77; }
-exec timeout -k 5 300 node "$tests/foxglove_peer.mjs" "$build" "$modules"
+exec timeout -k 5 1500 node "$tests/foxglove_peer.mjs" "$build" "$modules"

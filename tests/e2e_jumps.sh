@@ -111,7 +111,7 @@ step=$(status "s['step']")
 until_true 60 holds "s['step'] > $step + 300" || fail "ignore: the map stands after a jump"
 say '?PAUSE' >/dev/null
 until_true 60 holds "s['queue']['idle']"
-timeout 60 "$facet" save "$address" -o "$dir/held.ply" >/dev/null || fail "ignore: no mesh"
+timeout 300 "$facet" save "$address" -o "$dir/held.ply" >/dev/null || fail "ignore: no mesh"
 # The hall is 15 x 9 m: another frame would put walls elsewhere.
 python3 - "$dir/held.ply" "$scratch/ignore.size" <<'END' || fail "ignore: $(cat "$scratch/ignore.size")"
 import struct, sys
@@ -143,7 +143,7 @@ fi
 until_true 60 holds "s['step'] >= 60" || fail "new_map: the new map does not grow"
 say '?PAUSE' >/dev/null
 until_true 60 holds "s['queue']['idle']"
-timeout 60 "$facet" save "$address" -o "$dir/after.ply" >/dev/null || fail "new_map: no mesh after the jump"
+timeout 300 "$facet" save "$address" -o "$dir/after.ply" >/dev/null || fail "new_map: no mesh after the jump"
 end
 if [ -x "$build/tests/test_replay" ]; then
     for list in journal:$dir/archive/$map.ply journal.2:$dir/after.ply; do

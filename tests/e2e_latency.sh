@@ -15,7 +15,7 @@ kill $!
 wait
 exit "${status:-0}"
 END
-timeout 120 "$build/facet" simulate hall --servo can --endless --sent "$out/sent" -- sh "$out/inside" "$build" "$out" >"$out/simulate" ||
+timeout 600 "$build/facet" simulate hall --servo can --endless --sent "$out/sent" -- sh "$out/inside" "$build" "$out" >"$out/simulate" ||
     { cat "$out/simulate" "$out/error" "$out/daemon.log"; exit 1; }
 cat "$out/latency"
 

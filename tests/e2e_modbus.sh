@@ -62,7 +62,7 @@ assert abs(did["angle"] - 5) < 0.2 and did["enabled"] == 0, "the end"
 assert -20.1 <= did["bottom"] < -19.5 and 29.5 < did["top"] <= 30.1, "angles"
 print(f"note: modbus-serial by {sys.argv[1]}: {did['targets']} targets, {did['turns']} turns, {did['reads']} reads")
 PYTHON
-    until_true 1 grep -q 'ends' "$scratch/facetd.log" || fail "modbus-serial by $1: no orderly end"
+    until_true 10 grep -q 'ends' "$scratch/facetd.log" || fail "modbus-serial by $1: no orderly end"
     tried=$((tried + 1))
 }
 
@@ -88,7 +88,7 @@ play_peer() {
 
 # mbpoll once, unit 1, addresses from 0
 poll() {
-    timeout 20 mbpoll -q -1 -0 -B -a 1 "$@" 2>&1
+    timeout 60 mbpoll -o 10 -q -1 -0 -B -a 1 "$@" 2>&1
 }
 
 position() { # TRANSPORT...: in 0.001 degree

@@ -10,12 +10,12 @@ uos=../shared/data/kurt3d
 play() {
     rm -rf "$scratch/d" "$scratch/journal" "$scratch/live.ply"
     # shellcheck disable=SC2016
-    timeout -k 5 240 "$facet" simulate "profiles:$tilt/kurt3d_scan0_profiles.csv" "$tilt/kurt3d_scan1_profiles.csv" \
+    timeout -k 5 700 "$facet" simulate "profiles:$tilt/kurt3d_scan0_profiles.csv" "$tilt/kurt3d_scan1_profiles.csv" \
         "$tilt/kurt3d_scan2_profiles.csv" --speed max --dir "$scratch/d" -- sh -eu -c '
         "$facetd" --journal "$scratch/journal" 2>"$scratch/log" &
         daemon=$!
         until [ -S "$scratch/d/facetd.sock" ]; do kill -0 $daemon; sleep 0.1; done
-        "$facet" save --wait-steps 678 --timeout 200 -o "$scratch/live.ply"
+        "$facet" save --wait-steps 678 --timeout 600 -o "$scratch/live.ply"
         kill $daemon
         wait $daemon
     ' >"$scratch/simulate.log" 2>&1 || { cat "$scratch/simulate.log" "$scratch/log"; exit 1; }

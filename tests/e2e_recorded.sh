@@ -15,7 +15,7 @@ until_true 30 test -s "$scratch/sim/facetd.yaml" || { cat "$scratch/simulate.log
 "$facetd" --config "$scratch/facetd.yaml" --journal "$scratch/journal" >"$scratch/log" 2>&1 &
 daemon=$!
 until_true 30 files 2 || fail "no second file: $(cat "$scratch/log")"
-timeout 60 "$facet" record "unix:$scratch/sim/facetd.sock" -o "$scratch/taken.mcap" -d 2 >"$scratch/said" 2>&1 || fail "facet record: $(cat "$scratch/said")"
+timeout 300 "$facet" record "unix:$scratch/sim/facetd.sock" -o "$scratch/taken.mcap" -d 2 >"$scratch/said" 2>&1 || fail "facet record: $(cat "$scratch/said")"
 until_true 30 files 3 || fail "no third file: $(cat "$scratch/log")"
 kill $daemon
 wait $daemon || fail "not an orderly end"

@@ -8,14 +8,14 @@ set -u
 refused() {
     status=$1 words=$2
     shift 2
-    timeout 30 "$facet" simulate "$@" >"$scratch/stdout" 2>"$scratch/stderr"
+    timeout 200 "$facet" simulate "$@" >"$scratch/stdout" 2>"$scratch/stderr"
     [ $? -eq "$status" ] || fail "simulate $*: status is not $status"
     grep -q -- "$words" "$scratch/stderr" || fail "simulate $*: does not say '$words' but: $(head -n 2 "$scratch/stderr")"
     head -n 1 "$scratch/stderr" | grep -q '^facet' || fail "simulate $*: the sentence does not name the program"
 }
 
 gone() { # no process has this text in its command line
-    for _ in 1 2 3 4 5 6 7 8 9 10; do
+    for _ in $(seq 150); do
         pgrep -f "$1" >/dev/null || return 0
         sleep 0.2
     done
@@ -23,7 +23,7 @@ gone() { # no process has this text in its command line
 }
 
 # Usage
-timeout 30 "$facet" simulate --help | grep -q 'profiles:FILE.csv' || fail "--help does not say how sweeps are played"
+timeout 200 "$facet" simulate --help | grep -q 'profiles:FILE.csv' || fail "--help does not say how sweeps are played"
 refused 2 'which scenario'
 refused 2 'one word too many' hall kitchen
 refused 2 'no colon behind the device' hall --fault noise
@@ -65,28 +65,28 @@ printf '0,1000,1001\n1,1000,x\n' >"$scratch/bad.csv"
 refused 1 'bad.csv: line 2' "profiles:$scratch/bad.csv"
 
 # COMMAND: its environment, its status, its devices, a fresh directory that goes with it
-timeout 30 "$facet" simulate hall -- sh -c 'echo "$FACETD|$FACETD_CONFIG"; ls -l "$(dirname "$FACETD_CONFIG")"; exit 7' >"$scratch/env"
+timeout 200 "$facet" simulate hall -- sh -c 'echo "$FACETD|$FACETD_CONFIG"; ls -l "$(dirname "$FACETD_CONFIG")"; exit 7' >"$scratch/env"
 [ $? -eq 7 ] || fail "COMMAND's status is not handed on"
 config=$(sed -n 's/^unix:.*|//p' "$scratch/env")
 grep -q "^address unix:${config%/*}/facetd.sock" "$scratch/env" || fail "the address is not said"
 grep -q 'laser -> /dev/pts' "$scratch/env" && grep -q 'servo -> /dev/pts' "$scratch/env" || fail "the devices are not in the directory"
 [ -n "$config" ] && [ ! -e "${config%/*}" ] || fail "a fresh directory was left"
-timeout 30 "$facet" simulate hall -- /nowhere/program 2>"$scratch/stderr"
+timeout 200 "$facet" simulate hall -- /nowhere/program 2>"$scratch/stderr"
 [ $? -eq 127 ] || fail "a COMMAND that is not there: status is not 127"
 grep -q '/nowhere/program: No such file' "$scratch/stderr" || fail "a COMMAND that is not there is not named"
 
 # A directory that was given stays, its links go; the configuration is one that the daemon takes
-timeout 30 "$facet" simulate building --dir "$scratch/given" --servo tcp --tcp 127.0.0.1:7999 -- \
+timeout 200 "$facet" simulate building --dir "$scratch/given" --servo tcp --tcp 127.0.0.1:7999 -- \
     sh -c "$build/facetd --check-config"' --config "$FACETD_CONFIG"' >"$scratch/check" 2>&1 || fail "facetd refuses the configuration: $(cat "$scratch/check")"
 [ -e "$scratch/given/facetd.yaml" ] && [ ! -e "$scratch/given/laser" ] && [ ! -e "$scratch/given/servo" ] || fail "given directory: $(ls "$scratch/given")"
 grep -q 'tcp:127.0.0.1:7999' "$scratch/given/facetd.yaml" || fail "--tcp is not in the configuration"
 
 # Nothing outlives it: what COMMAND left behind, what ignores SIGTERM, and when it is itself ended
-timeout 40 "$facet" simulate hall -- sh -c 'sleep 7771 & sleep 0.3'
+timeout 200 "$facet" simulate hall -- sh -c 'sleep 7771 & sleep 0.3'
 gone 'sleep 7771' || fail "an orphan of COMMAND outlived it"
-timeout 60 "$facet" simulate hall --dir "$scratch/stopped" -- sh -c 'trap "" TERM; while :; do sleep 0.1; done # deaf-7772' &
+timeout 400 "$facet" simulate hall --dir "$scratch/stopped" -- sh -c 'trap "" TERM; while :; do sleep 0.1; done # deaf-7772' &
 simulate=$!
-for _ in $(seq 100); do [ -e "$scratch/stopped/facetd.yaml" ] && pgrep -f deaf-7772 >/dev/null && break; sleep 0.1; done
+for _ in $(seq 600); do [ -e "$scratch/stopped/facetd.yaml" ] && pgrep -f deaf-7772 >/dev/null && break; sleep 0.1; done
 kill -TERM "$(pgrep -f "simulate hall --dir $scratch/stopped" | tail -n 1)"
 wait $simulate
 [ $? -eq 143 ] || fail "ended by SIGTERM: status is not 143"
@@ -96,7 +96,7 @@ gone deaf-7772 || fail "a COMMAND that ignores SIGTERM outlived it"
 # The real thing, short: the hall through facetd into a mesh, with every scanner
 cat >"$scratch/map.sh" <<'MAP'
 "$facetd" 2>"$scratch/$laser.log" & daemon=$!
-for i in $(seq 60); do
+for i in $(seq 400); do
     sleep 1
     "$facet" save -o "$scratch/$laser.ply" >"$scratch/$laser.save" 2>&1 && [ "$(sed -n 's/.*step \([0-9]*\),.*/\1/p' "$scratch/$laser.save")" -gt "$steps" ] && break
 done
@@ -109,7 +109,7 @@ export build facet out laser steps
 map() {
     laser=$1 steps=$2 faces=$3
     shift 3
-    timeout 120 "$facet" simulate hall --endless "$@" -- sh "$scratch/map.sh" >"$scratch/$laser.said" || fail "$laser: facetd did not end well: $(tail -n 3 "$scratch/$laser.log")"
+    timeout 600 "$facet" simulate hall --endless "$@" -- sh "$scratch/map.sh" >"$scratch/$laser.said" || fail "$laser: facetd did not end well: $(tail -n 3 "$scratch/$laser.log")"
     made=$(sed -n 's/.*, \([0-9]*\) faces.*/\1/p' "$scratch/$laser.save")
     [ "${made:-0}" -gt "$faces" ] || fail "$laser: the hall has no mesh: $(cat "$scratch/$laser.save" "$scratch/$laser.log")"
     grep -q '^laser: profiles [1-9]' "$scratch/$laser.said" || fail "$laser: what the scanner did is not said"
@@ -140,14 +140,14 @@ done
 # A bus that goes, as the daemon sees it and says it: once each
 cat >"$scratch/bus.sh" <<'BUS'
 "$facetd" 2>"$scratch/bus.log" & daemon=$!
-for i in $(seq 300); do
+for i in $(seq 1500); do
     [ "$(grep -ac 'facetd: servo: streaming' "$scratch/bus.log")" -ge 3 ] && break
     sleep 0.1
 done
 kill -TERM $daemon
 wait $daemon
 BUS
-timeout 60 "$facet" simulate hall --endless --servo can --fault 'can: bus-off at 2s for 1s' --fault 'can: down at 5s for 1s' -- sh "$scratch/bus.sh" >"$scratch/bus.said"
+timeout 400 "$facet" simulate hall --endless --servo can --fault 'can: bus-off at 2s for 1s' --fault 'can: down at 5s for 1s' -- sh "$scratch/bus.sh" >"$scratch/bus.said"
 [ "$(grep -ac 'facetd: servo: streaming' "$scratch/bus.log")" -ge 3 ] || fail "the servo does not come back with its bus: $(cat "$scratch/bus.log")"
 [ "$(grep -ac 'facetd: servo: lost' "$scratch/bus.log")" -eq 2 ] || fail "the loss of the bus is not said once each: $(cat "$scratch/bus.log")"
 grep -q 'can: frames [1-9].*dropped [1-9].*errors 2' "$scratch/bus.said" || fail "what the bus did is not said: $(cat "$scratch/bus.said")"
@@ -159,14 +159,14 @@ laser() { # the laser's lines of the log
     grep -a 'facetd: laser: ' "$scratch/faults.log"
 }
 loses() { # it was away, whether it had streamed by then or not
-    for i in $(seq 300); do
+    for i in $(seq 1500); do
         laser | grep -q 'laser: lost\|laser: not ready' && return 0
         sleep 0.1
     done
     echo "it did not lose the scanner"
 }
 streams() { # so many times the laser began to stream, and it does
-    for i in $(seq 300); do
+    for i in $(seq 1500); do
         [ "$(laser | grep -c 'laser: streaming')" -ge "$1" ] && laser | tail -n 1 | grep -q 'laser: streaming' && return 0
         sleep 0.1
     done
@@ -190,7 +190,7 @@ kill -TERM $daemon
 wait $daemon
 FAULTS
 for laser in lms2xx tim; do
-    timeout 120 "$facet" simulate hall --endless --laser $laser --fault 'laser: unplug at 2s for 2s' --fault 'laser: garbage at 1s for 200ms' -- sh "$scratch/faults.sh" >"$scratch/faults.said"
+    timeout 600 "$facet" simulate hall --endless --laser $laser --fault 'laser: unplug at 2s for 2s' --fault 'laser: garbage at 1s for 200ms' -- sh "$scratch/faults.sh" >"$scratch/faults.said"
     ! grep 'did not' "$scratch/faults.said" || fail "$laser does not come back: $(cat "$scratch/faults.log")"
     grep -q 'laser: lost' "$scratch/faults.log" || fail "$laser: facetd does not say that it lost the scanner"
     grep -q "^error: 'smoke': laser has no such fault; it has" "$scratch/faults.said" || fail "a wrong order is not refused"

@@ -28,12 +28,12 @@ for command in save watch picture; do
     "$facet" $command --help | grep -q '^Usage: facet' || fail "facet $command --help says nothing"
 done
 
-"$facet" simulate hall --dir "$scratch/run" -- "$facetd" >"$scratch/daemon.log" 2>&1 &
+"$facet" simulate hall --endless --dir "$scratch/run" -- "$facetd" >"$scratch/daemon.log" 2>&1 &
 daemon=$!
 until_true 30 "$facet" watch --once "$address" || { cat "$scratch/daemon.log"; fail "the daemon does not come up"; exit 1; }
 
 # The same snapshot in every format, of a map that grows meanwhile.
-"$facet" save "$address" -o "$scratch/early.ply" --wait-steps 20 --timeout 120 >"$scratch/out" || fail "no snapshot at step 20"
+"$facet" save "$address" -o "$scratch/early.ply" --wait-steps 20 --timeout 600 >"$scratch/out" || fail "no snapshot at step 20"
 step=$(sed -n 's/.*: step \([0-9]*\),.*/\1/p' "$scratch/out")
 [ "${step:-0}" -ge 20 ] || fail "--wait-steps 20 gave step ${step:-none}"
 for ending in ply obj stl glb json; do
@@ -43,7 +43,7 @@ done
 "$facet" save "$address" --ascii -o "$scratch/ascii.ply" >/dev/null && grep -q '^format ascii' "$scratch/ascii.ply" || fail "--ascii"
 [ "$(cat "$scratch/map.json")" = "[]" ] || fail "map.json is not the list of planes"
 # The servo looks up first: a map of half a sweep may be all ceiling, and nothing is left below the cut.
-"$facet" save "$address" -o "$scratch/look.ply" --wait-steps 220 --timeout 120 >/dev/null || fail "no snapshot at step 220"
+"$facet" save "$address" -o "$scratch/look.ply" --wait-steps 220 --timeout 600 >/dev/null || fail "no snapshot at step 220"
 "$facet" picture "$scratch/look.ply" -o "$scratch/map.png" --size 160x100 || fail "no picture of the map"
 ls "$scratch" | grep -q 'part' && fail "something half written is left"
 refused 1 "no whole map of step 99999999" "$facet" save "$address" -o "$scratch/never.ply" --wait-steps 99999999 --timeout 0.5
@@ -65,7 +65,7 @@ assert devices.keys() >= {"laser", "servo"}, status
 timing = devices["laser"]["timing"]
 assert timing["expected"] == 37.5 and 0 <= timing["jitter_ms"]["p50"] <= timing["jitter_ms"]["p99"], timing
 assert devices["laser"]["note"] == "" and devices["laser"]["silent"] >= 0, devices["laser"]' || fail "facet watch --json"
-timeout 20 "$facet" watch "$address" | head -n 2 >"$scratch/lines"
+timeout 120 "$facet" watch "$address" | head -n 2 >"$scratch/lines"
 [ "$(grep -c '^step [0-9]' "$scratch/lines")" -eq 2 ] || fail "facet watch in a pipe: $(cat "$scratch/lines")"
 
 # In a window of 80 columns and 24 rows nothing is cut off: lines are folded, the columns of the table fit.
@@ -76,7 +76,7 @@ pid, fd = pty.fork()
 if pid == 0:
     fcntl.ioctl(0, termios.TIOCSWINSZ, struct.pack("4H", 24, 80, 0, 0))
     os.execv(sys.argv[1], [sys.argv[1], "watch", sys.argv[2]])
-seen, end = b"", time.monotonic() + 30
+seen, end = b"", time.monotonic() + 120
 while seen.count(b"\033[J") < 2 and time.monotonic() < end:
     seen += os.read(fd, 65536)
 os.kill(pid, signal.SIGINT)
@@ -109,7 +109,7 @@ import json, socket, struct, sys, time
 
 def connect():
     s = socket.socket(socket.AF_UNIX)
-    s.settimeout(60)
+    s.settimeout(300)
     s.connect(sys.argv[1])
     return s.makefile("rwb")
 
@@ -176,7 +176,7 @@ grep -qF "$(cat "$scratch/documented")" "$scratch/out" ||
 echo "note: a client written from the document holds $(cat "$scratch/documented")"
 
 # A daemon that goes away is said once, and watched again when it is back.
-timeout 60 "$facet" watch "$address" >"$scratch/lines" 2>"$scratch/err" &
+timeout 600 "$facet" watch "$address" >"$scratch/lines" 2>"$scratch/err" &
 watch=$!
 until_true 20 grep -q '^step' "$scratch/lines" || fail "nothing is watched"
 kill "$daemon"
@@ -185,7 +185,7 @@ until_true 20 grep -q 'facet: .*; trying again every second' "$scratch/err" || f
 rm -rf "$scratch/run"
 mkdir "$scratch/run"
 : >"$scratch/lines"
-"$facet" simulate hall --dir "$scratch/run" -- "$facetd" >"$scratch/daemon.log" 2>&1 &
+"$facet" simulate hall --endless --dir "$scratch/run" -- "$facetd" >"$scratch/daemon.log" 2>&1 &
 daemon=$!
 until_true 40 grep -q 'step' "$scratch/lines" || fail "the daemon that came back is not watched: $(cat "$scratch/err")"
 kill -INT "$watch"

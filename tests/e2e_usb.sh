@@ -5,7 +5,7 @@
 bed=$build/tests/usb_bed
 
 wait_for() { # SECONDS FILE SENTENCE [TIMES]
-    left=$(($1 * 10))
+    left=$(($1 * 10 * patience))
     while [ "$(cat "$2" 2>/dev/null | grep -cF -- "$3")" -lt "${4:-1}" ]; do
         [ $left -gt 0 ] || { fail "not within $1 s: $3"; sed 's/^/    /' "$2"; return 1; }
         left=$((left - 1))
@@ -65,10 +65,10 @@ wait $bed_pid || fail "the daemon ended with status $?"
 
 # Twins: `usb` alone says which two there are, a serial number finds its own.
 configure both usb
-timeout 20 "$bed" --scanner 1-1=16160456 --scanner 1-2=18220118 -- "$facetd" --config "$scratch/both.yaml" \
+timeout 400 "$bed" --scanner 1-1=16160456 --scanner 1-2=18220118 -- "$facetd" --config "$scratch/both.yaml" \
     >"$scratch/both" 2>&1 &
 configure second usb:18220118
-timeout 20 "$bed" --scanner 1-1=16160456 --scanner 1-2=18220118 -- "$facetd" --config "$scratch/second.yaml" \
+timeout 400 "$bed" --scanner 1-1=16160456 --scanner 1-2=18220118 -- "$facetd" --config "$scratch/second.yaml" \
     >"$scratch/second" 2>&1 &
 wait_for 20 "$scratch/both" "2 scanners are plugged in; write one of these as \`connect\`: usb:16160456, usb:18220118"
 wait_for 20 "$scratch/second" "bed: first request of 1-2"

@@ -7,4 +7,4 @@ command -v python3 >/dev/null || {
     echo "python3 is not installed"
     exit 77
 }
-exec timeout -k 5 380 python3 tests/web_judge.py "$build"
+exec timeout -k 5 1500 python3 tests/web_judge.py "$build"

@@ -23,11 +23,13 @@ const dir = mkdtempSync(join(tmpdir(), 'foxglove-'));
 const ours = [];
 const sleep = (ms) => new Promise((done) => setTimeout(done, ms));
 
+// SECONDS are a fast machine's; this one may be slow, or busy with others.
+const PATIENCE = 5;
 async function until(what, seconds, ask) {
-  for (const end = Date.now() + seconds * 1000; ;) {
+  for (const end = Date.now() + PATIENCE * seconds * 1000; ;) {
     const answer = await ask();
     if (answer) return answer;
-    assert.ok(Date.now() < end, `waited ${seconds} s for ${typeof what === 'function' ? what() : what}`);
+    assert.ok(Date.now() < end, `waited ${PATIENCE * seconds} s for ${typeof what === 'function' ? what() : what}`);
     await sleep(100);
   }
 }
@@ -43,7 +45,7 @@ function start(program, words, env = {}) {
 
 async function end(child, signal) {
   child.kill(signal);
-  await Promise.race([child.gone, sleep(20000).then(() => child.kill('SIGKILL'))]);
+  await Promise.race([child.gone, sleep(120000).then(() => child.kill('SIGKILL'))]);
 }
 
 const freePort = () => new Promise((done) => {
@@ -318,13 +320,12 @@ async function main() {
   assert.ok(behind.queued <= QUEUED, `a stalled client costs ${behind.queued} bytes`);
   stalled.ws.resume();
 
+  const told = ({ counts }) => ['/map', '/tf', '/pose', '/scan/laser', 'time'].every((topic) => counts[topic] > 20);
+  await until('much of each topic', 60, () => told(json) && told(binary));
   await command('PAUSE');
-  let before = null;
   const still = await until('the map to stand', 30, async () => {
-    const now = await status(), same = now.queue.idle && before?.step === now.step && before.map_size.triangles === now.map_size.triangles;
-    before = now;
-    await sleep(300);
-    return same && now;
+    const now = await status();
+    return now.queue.idle && now;
   });
   const late = new Listener(port, 'foxglove.sdk.v1', '', (topic) => topic === '/map');
   const points = savedPoints(), { map_size: map } = still;

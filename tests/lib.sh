@@ -13,7 +13,7 @@ scratch=$(mktemp -d) || exit 2
 failed=0
 export build facet facetd scratch
 
-# Processes are asked to end, also those that were stopped, and get five seconds for it.
+# Processes are asked to end, also those that were stopped, and get half a minute for it.
 end_all() {
     jobs -p >"$scratch/jobs" # not in a subshell, which has no jobs
     pids=$(cat "$scratch/jobs")
@@ -22,7 +22,7 @@ end_all() {
     {
         kill $pids
         kill -CONT $pids
-        (sleep 5 && exec kill -KILL $pids) &
+        (sleep 30 && exec kill -KILL $pids) &
         killer=$!
         for pid in $pids; do wait "$pid"; done
         kill $killer
@@ -52,8 +52,11 @@ skip() { # WHY
     exit 77
 }
 
+# How many times as long as is said here is waited for what is sure to come: the machine may be slow, or busy with others.
+patience=5
+
 until_true() { # SECONDS COMMAND...: tried five times a second, unheard
-    last=$(($(date +%s) + $1))
+    last=$(($(date +%s) + $1 * patience))
     shift
     until "$@" >/dev/null 2>&1; do
         [ "$(date +%s)" -le $last ] || return 1
@@ -71,7 +74,7 @@ say() { # COMMAND: its answer, one line of JSON
     python3 - "${address#unix:}" "$1" <<'PYTHON'
 import json, socket, sys
 s = socket.socket(socket.AF_UNIX)
-s.settimeout(20)
+s.settimeout(120)
 s.connect(sys.argv[1])
 s.sendall(sys.argv[2].encode() + b"\n")
 for line in s.makefile():
@@ -82,7 +85,7 @@ PYTHON
 }
 
 status() { # EXPRESSION over its status s and devices d by name: the value; 1 where that is false, or there is none
-    timeout 20 "$facet" watch --once --json "$address" 2>/dev/null | python3 -c '
+    timeout 120 "$facet" watch --once --json "$address" 2>/dev/null | python3 -c '
 import json, sys
 line = sys.stdin.readline()
 if not line: sys.exit(1)

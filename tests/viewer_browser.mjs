@@ -4,16 +4,17 @@ import { mkdtempSync, rmSync, writeFileSync } from 'node:fs';
 import { tmpdir } from 'node:os';
 import { join } from 'node:path';
 
-const ANSWER_MS = 30000;
+const ANSWER_MS = 180000;
+const PATIENCE = 5; // times as long as is said is waited: the machine may be slow, or busy with others
 
 export const sleep = (ms) => new Promise((done) => setTimeout(done, ms));
 
 export async function until(what, seconds, ask) {
-  const last = Date.now() + 1000 * seconds;
+  const last = Date.now() + 1000 * PATIENCE * seconds;
   for (;;) {
     const answer = await ask();
     if (answer) return answer;
-    if (Date.now() > last) throw new Error(`${what}: not within ${seconds} s`);
+    if (Date.now() > last) throw new Error(`${what}: not within ${PATIENCE * seconds} s`);
     await sleep(100);
   }
 }

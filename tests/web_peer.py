@@ -14,7 +14,7 @@ class Closed(Exception):
         self.code, self.reason = code, reason
 
 
-def dial(port, tls=None, receive=0, timeout=20):
+def dial(port, tls=None, receive=0, timeout=120):
     s = socket.socket()
     if receive:
         s.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, receive)

@@ -85,7 +85,7 @@ static struct facet *open_facet(void)
 	char error[FACET_ERROR_MAX];
 	struct facet *facet = NULL;
 
-	for (int i = 0; !facet && i < 100; i++) {
+	for (int i = 0; !facet && i < 600; i++) {
 		const struct timespec wait = {.tv_nsec = 100000000};
 
 		facet = facet_open(NULL, 1000, error);
@@ -135,7 +135,7 @@ static int64_t rows_not_applied(void)
 	json_int_t rows = -1;
 
 	facet_say(facet, "?STATUS");
-	while (rows < 0 && facet_wait(facet, 5000, &event) > 0 && event.kind == FACET_JSON) {
+	while (rows < 0 && facet_wait(facet, 60000, &event) > 0 && event.kind == FACET_JSON) {
 		json_t *json = json_loadb(event.text, event.len, 0, NULL), *value;
 
 		value = json_object_get(json_object_get(json, "rows"), "not_applied");

@@ -40,9 +40,9 @@ drive.stderr.pipe(process.stderr);
 
 const line = (begin) => new Promise((resolve) => waiting.push({ begin, resolve }));
 const read = (index, dataType, subIndex) =>
-	master.sdo.upload({ serverId: NODE, index, subIndex, dataType, timeout: 5000 });
+	master.sdo.upload({ serverId: NODE, index, subIndex, dataType, timeout: 60000 });
 const write = (index, data, dataType, subIndex) =>
-	master.sdo.download({ serverId: NODE, index, subIndex, data, dataType, timeout: 5000 });
+	master.sdo.download({ serverId: NODE, index, subIndex, data, dataType, timeout: 60000 });
 const state = async (mask, bits) => {
 	for (;;) {
 		const word = await read(0x6041, U16);
@@ -118,7 +118,7 @@ async function emergency() {
 
 async function main() {
 	master.eds.addSdoClientParameter(NODE, 0x600 | NODE, 0x580 | NODE);
-	master.eds.addHeartbeatConsumer(NODE, 5000);
+	master.eds.addHeartbeatConsumer(NODE, 60000);
 	master.eds.addEmcyConsumer(0x80 | NODE);
 	master.eds.setSyncCobId(0x80);
 	master.eds.setSyncGenerationEnable(true);
@@ -135,7 +135,7 @@ async function main() {
 setTimeout(() => {
 	console.log('canopen_peer: it took too long; last heard:\n' + heard.slice(-10).join('\n'));
 	process.exit(1);
-}, 60000);
+}, 500000);
 main().then(() => process.exit(0), (e) => {
 	console.log(e, '\nlast heard:\n' + heard.slice(-10).join('\n'));
 	process.exit(1);

@@ -24,8 +24,8 @@
 #define FIXED   4 /* clients with a part to play; the others act at random */
 #define CLIENTS 12
 /* No new step for so long, and everyone at the same one: the end. The look-ahead is folded a second after the last row. */
-#define QUIET_S 3.0
-#define LIMIT_S 220 /* then it has failed */
+#define QUIET_S 8.0
+#define LIMIT_S 900 /* then it has failed */
 #define MISSED \
 	(20 * 16384) /* bytes that the stall lasts for at least: twenty send buffers of the daemon's configuration */
 #define STEPS_MAX 100000

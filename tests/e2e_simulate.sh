@@ -98,14 +98,16 @@ cat >"$scratch/map.sh" <<'MAP'
 "$facetd" 2>"$scratch/$laser.log" & daemon=$!
 for i in $(seq 400); do
     sleep 1
-    "$facet" save -o "$scratch/$laser.ply" >"$scratch/$laser.save" 2>&1 && [ "$(sed -n 's/.*step \([0-9]*\),.*/\1/p' "$scratch/$laser.save")" -gt "$steps" ] && break
+    "$facet" save -o "$scratch/$laser.ply" >"$scratch/$laser.save" 2>&1 || continue
+    [ "$(sed -n 's/.*step \([0-9]*\),.*/\1/p' "$scratch/$laser.save")" -gt "$steps" ] &&
+        [ "$(sed -n 's/.*, \([0-9]*\) faces.*/\1/p' "$scratch/$laser.save")" -gt "$faces" ] && break
 done
 kill -TERM $daemon
 wait $daemon
 MAP
-export build facet out laser steps
+export build facet out laser steps faces
 
-# map LASER STEPS FACES [OPTIONS...]: after so many steps the hall has more than so many faces
+# map LASER STEPS FACES [OPTIONS...]: after so many steps and seconds enough the hall has more than so many faces
 map() {
     laser=$1 steps=$2 faces=$3
     shift 3
@@ -120,10 +122,15 @@ map tim 60 2000 --laser tim
 map lms1xx 150 2000 --laser lms1xx --servo can --odometry=speed
 map lms5xx 80 2000 --laser lms5xx --servo modbus-tcp --encoder
 
-# Every other servo, all at once: its angle places rows, and nothing of it is lost or refused
+# Every other servo, all at once: its angle places rows, and nothing of it is lost or refused. A machine that stands still for longer
+# than a silent servo is borne loses it by the rules; then the same is tried again.
 try_servo() {
-    map "$1" 40 300 --servo "$1" --truth "$scratch/$1.truth"
-    ! grep 'servo: lost\|servo: not ready' "$scratch/$1.log" || fail "$1: was lost"
+    for try in 1 2 3 4 5; do
+        map "$1" 40 300 --servo "$1" --truth "$scratch/$1.truth"
+        lost=$(grep 'servo: lost\|servo: not ready' "$scratch/$1.log") || break
+        echo "note: $1: try $try: $lost"
+    done
+    [ -z "$lost" ] || fail "$1: was lost in each of $try tries: $lost"
     grep -q "; servo $1: angle [-0-9.]* deg, speed" "$scratch/$1.said" || fail "$1: what the servo did is not said"
     [ "$(awk 'NF == 6' "$scratch/$1.truth" | wc -l)" -gt 500 ] || fail "$1: the truth is not written"
     exit "$failed"
@@ -138,18 +145,37 @@ for pid in $pids; do
 done
 
 # A bus that goes, as the daemon sees it and says it: once each
+cat >"$scratch/order.py" <<'ORDER'
+import os, socket, sys
+s = socket.socket(socket.AF_UNIX)
+s.connect(os.path.join(os.path.dirname(os.environ["FACETD"].removeprefix("unix:")), "simulator.sock"))
+f = s.makefile("rw")
+for line in sys.argv[1:]:
+    f.write(line + "\n")
+    f.flush()
+    print(f.readline().strip())
+ORDER
 cat >"$scratch/bus.sh" <<'BUS'
 "$facetd" 2>"$scratch/bus.log" & daemon=$!
-for i in $(seq 1500); do
-    [ "$(grep -ac 'facetd: servo: streaming' "$scratch/bus.log")" -ge 3 ] && break
-    sleep 0.1
-done
+streams() { # so many times
+    for i in $(seq 1500); do
+        [ "$(grep -ac 'facetd: servo: streaming' "$scratch/bus.log")" -ge $1 ] && break
+        sleep 0.1
+    done
+}
+streams 1
+python3 "$scratch/order.py" 'can: bus-off for 1s'
+streams 2
+python3 "$scratch/order.py" 'can: down for 1s'
+streams 3
 kill -TERM $daemon
 wait $daemon
 BUS
-timeout 400 "$facet" simulate hall --endless --servo can --fault 'can: bus-off at 2s for 1s' --fault 'can: down at 5s for 1s' -- sh "$scratch/bus.sh" >"$scratch/bus.said"
+timeout 600 "$facet" simulate hall --endless --servo can -- sh "$scratch/bus.sh" >"$scratch/bus.said"
 [ "$(grep -ac 'facetd: servo: streaming' "$scratch/bus.log")" -ge 3 ] || fail "the servo does not come back with its bus: $(cat "$scratch/bus.log")"
-[ "$(grep -ac 'facetd: servo: lost' "$scratch/bus.log")" -eq 2 ] || fail "the loss of the bus is not said once each: $(cat "$scratch/bus.log")"
+for loss in bus-off 'whoever carried CAN frames there has gone'; do
+    [ "$(grep -ac "facetd: servo: lost: .*$loss" "$scratch/bus.log")" -eq 1 ] || fail "the loss of the bus is not said once each: $(cat "$scratch/bus.log")"
+done
 grep -q 'can: frames [1-9].*dropped [1-9].*errors 2' "$scratch/bus.said" || fail "what the bus did is not said: $(cat "$scratch/bus.said")"
 
 # Faults: ordered by the command line and at the socket, seen by the daemon, and recovered from
@@ -175,22 +201,18 @@ streams() { # so many times the laser began to stream, and it does
 loses
 streams 1
 before=$(laser | grep -c 'laser: streaming')
-python3 - "${FACETD#unix:}" <<'ORDERS'
-import os, socket, sys
-s = socket.socket(socket.AF_UNIX)
-s.connect(os.path.join(os.path.dirname(sys.argv[1]), "simulator.sock"))
-f = s.makefile("rw")
-for line in "laser: smoke", '{"fault": "laser: power for 500ms"}', "status", '{"status": true}':
-    f.write(line + "\n")
-    f.flush()
-    print(f.readline().strip())
-ORDERS
+python3 "$scratch/order.py" 'laser: garbage for 200ms' # the one at 1s may have come before the daemon
+for i in $(seq 600); do
+    python3 "$scratch/order.py" status | grep -q 'garbage [1-9]' && break
+    sleep 0.1
+done
+python3 "$scratch/order.py" 'laser: smoke' '{"fault": "laser: power for 500ms"}' status '{"status": true}'
 streams $((before + 1))
 kill -TERM $daemon
 wait $daemon
 FAULTS
 for laser in lms2xx tim; do
-    timeout 600 "$facet" simulate hall --endless --laser $laser --fault 'laser: unplug at 2s for 2s' --fault 'laser: garbage at 1s for 200ms' -- sh "$scratch/faults.sh" >"$scratch/faults.said"
+    timeout 600 "$facet" simulate hall --endless --laser $laser --fault 'laser: unplug at 2s for 6s' --fault 'laser: garbage at 1s for 200ms' -- sh "$scratch/faults.sh" >"$scratch/faults.said"
     ! grep 'did not' "$scratch/faults.said" || fail "$laser does not come back: $(cat "$scratch/faults.log")"
     grep -q 'laser: lost' "$scratch/faults.log" || fail "$laser: facetd does not say that it lost the scanner"
     grep -q "^error: 'smoke': laser has no such fault; it has" "$scratch/faults.said" || fail "a wrong order is not refused"

@@ -57,7 +57,7 @@ waits = [float(s) for s in re.findall(r"first request of 1-1 after ([0-9.]+)", o
 log = open(sys.argv[2]).read()
 lost = log.count("laser: lost") - log.count("laser: lost: no scan")  # a machine that stands still loses it as well
 assert lost == 1, log  # by the pulled plug, not by the halt
-assert len(waits) == 2 and waits[1] < 10, waits  # 2 s on a machine that has the time
+assert len(waits) == 2 and waits[1] < 60, waits  # 2 s on a machine that has the time
 print(f"note: {counters['profiles']} profiles; first request {waits[1]:.2f} s after the scanner was back")
 END
 kill -TERM "$(cat "$scratch/daemon")"

@@ -124,10 +124,10 @@ static bool send_begin(struct publisher_client *client)
 /* Coded patches are small: as many as fit into the buffer share a frame, which is open as long as only such come. */
 static void send_coded(struct native_stream *stream, const struct publisher_item *item)
 {
-	uint8_t *head = stream->out + stream->open_at;
-	uint32_t length;
-
 	if (stream->open_at != NO_FRAME && item->len <= STREAM_OUT_BYTES - stream->out_len) {
+		uint8_t *head = stream->out + stream->open_at;
+		uint32_t length;
+
 		memcpy(&length, head, sizeof(length));
 		length += (uint32_t)item->len;
 		memcpy(head, &length, sizeof(length));

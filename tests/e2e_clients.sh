@@ -29,7 +29,7 @@ sed -e 's/baud: 500000/baud: 38400/' -e "s|^listen: {native: \[\([^]]*\)\]|liste
     "$scratch/d/facetd.yaml" >"$scratch/config.yaml"
 "$facetd" --config "$scratch/config.yaml" --journal "$scratch/journal" 2>"$scratch/daemon.log" &
 daemon=$!
-wait_for $daemon [ -S "$scratch/d/facetd.sock" ]
+wait_for $daemon grep -qs "listens on tcp" "$scratch/daemon.log"
 "$build/tests/clients" "$scratch/d/facetd.sock" "$port" "$scratch/held" "$JOIN_S" "$STALL_FROM_S" "$STALL_S" >"$scratch/clients.log" 2>&1 ||
     { cat "$scratch"/*.log; exit 1; }
 cat "$scratch/clients.log"

@@ -12,11 +12,14 @@ mkdir "$scratch/sim"
 "$facet" simulate building --endless --dir "$scratch/sim" >"$scratch/simulate.log" 2>&1 &
 until_true 30 test -s "$scratch/sim/facetd.yaml" || { cat "$scratch/simulate.log"; exit 1; }
 { cat "$scratch/sim/facetd.yaml"; echo "record: {dir: $scratch/rec, max_age: 2s, messages: on}"; } >"$scratch/facetd.yaml"
+address=unix:$scratch/sim/facetd.sock
 "$facetd" --config "$scratch/facetd.yaml" --journal "$scratch/journal" >"$scratch/log" 2>&1 &
 daemon=$!
 until_true 30 files 2 || fail "no second file: $(cat "$scratch/log")"
-timeout 300 "$facet" record "unix:$scratch/sim/facetd.sock" -o "$scratch/taken.mcap" -d 2 >"$scratch/said" 2>&1 || fail "facet record: $(cat "$scratch/said")"
-until_true 30 files 3 || fail "no third file: $(cat "$scratch/log")"
+timeout 300 "$facet" record "$address" -o "$scratch/taken.mcap" -d 2 >"$scratch/said" 2>&1 || fail "facet record: $(cat "$scratch/said")"
+until_true 60 holds "s['step'] > 60" || fail "no map: $(cat "$scratch/log")"
+there=$(ls "$scratch/rec" | wc -l) # two more, each with rows in it, and many before
+until_true 60 holds "s['step'] > $(status "s['step']") + 10" && until_true 30 files $((there + 2)) || fail "no further files: $(cat "$scratch/log")"
 kill $daemon
 wait $daemon || fail "not an orderly end"
 first=$(ls "$scratch"/rec/*.mcap | head -n 1)
@@ -27,13 +30,16 @@ head -c "$(($(wc -c <"$first") * 2 / 3))" "$first" >"$scratch/cut.mcap"
 "$facet" replay "$scratch"/rec/*.mcap -o "$scratch/a.ply" --stats "$scratch/a.json" >/dev/null || fail "the files do not replay"
 "$facet" replay "$scratch/journal" --config "$scratch/facetd.yaml" -o "$scratch/b.ply" --stats "$scratch/b.json" >/dev/null || fail "the journal does not replay"
 cmp -s "$scratch/a.ply" "$scratch/b.ply" || fail "the recording gives another map than the journal"
-number=1 last=$(ls "$scratch"/rec/*.mcap | tail -n 1)
+number=1 midst=0
 for file in "$scratch"/rec/*.mcap; do
-    least=1
-    [ "$file" = "$last" ] && least=0 # it may have been begun for the last record
-    [ $number -eq 1 ] || replays_midway "file $number of the rotation alone" "$file" "$scratch/journal" "$scratch/facetd.yaml" $least
+    if [ $number -gt 1 ]; then
+        replays_midway "file $number of the rotation alone" "$file" "$scratch/journal" "$scratch/facetd.yaml" -1 0
+        [ "$rows" -gt 10 ] && [ "$taken" -ge 1 ] && midst=$((midst + 1))
+    fi
     number=$((number + 1))
 done
+# A busy machine may have rows neither for the first seconds nor for the last.
+[ $midst -ge 1 ] || fail "no file has rows in it and others before it"
 
 packages=$(tests/npm/install "$build") || { [ $failed -eq 0 ] || exit 1; echo "$packages"; exit 77; }
 for file in "$scratch"/rec/*.mcap "$scratch/taken.mcap" "$scratch/repaired.mcap"; do
@@ -43,7 +49,7 @@ for file in "$scratch"/rec/*.mcap "$scratch/taken.mcap" "$scratch/repaired.mcap"
 import json, sys
 ours, theirs, name = json.load(open(sys.argv[1])), json.load(open(sys.argv[2])), sys.argv[3]
 counts = {c["topic"]: c["messages"] for c in ours["channels"] if c["messages"]}
-assert ours["whole"] and ours["statistics_agree"] and ours["messages"] > 10, ours
+assert ours["whole"] and ours["statistics_agree"] and ours["messages"] > 0, ours
 for reader in ("indexed", "streamed"):
     found = theirs[reader]
     assert found["messages"] == ours["messages"] and found["topics"] == counts, f"{name}, {reader}: {found['topics']}, not {counts}"

@@ -107,7 +107,7 @@ hash_of() { # ARGUMENT... of facet replay: of the map, which is in $scratch/out.
 
 # A recording from the midst of a drive gives the map of the rows from then on: of the drive's whole list (which a daemon that ended in
 # order has kept) without the rows before it, fed by another program.
-replays_midway() { # TITLE RECORDING JOURNAL CONFIG [ROWS]: it has so many at least (1)
+replays_midway() { # TITLE RECORDING JOURNAL CONFIG [BEFORE ROWS]: more than so many before it (10), so many in it at least (1)
     "$facet" info --json "$2" >"$scratch/told.json" || { fail "$1: facet info"; return; }
     python3 tests/kept_list.py --ended before "$3" "$scratch/told.json" "$scratch/before" || { fail "$1: it begins at no tick"; return; }
     hash_of --config "$4" "$scratch/before" >/dev/null
@@ -118,6 +118,6 @@ replays_midway() { # TITLE RECORDING JOURNAL CONFIG [ROWS]: it has so many at le
     [ "$got" = "${wanted%% *}" ] || fail "$1: $got, not $wanted"
     cmp -s "$scratch/out.ply" "$scratch/from.ply" || fail "$1: another mesh"
     taken=$(awk '/ not applied, map/ { print $4 }' "$scratch/told")
-    [ "$rows" -gt 10 ] && [ "$taken" -ge "${5:-1}" ] || fail "$1: $rows rows before it and $taken in it are too few"
+    [ "$rows" -gt "${5:-10}" ] && [ "$taken" -ge "${6:-1}" ] || fail "$1: $rows rows before it and $taken in it are too few"
     echo "note: $1: $taken rows after $rows others"
 }

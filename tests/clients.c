@@ -491,5 +491,12 @@ int main(int argc, char **argv)
 	}
 	if (t.client[1].commits >= t.client[0].commits || t.client[2].commits >= t.client[0].commits)
 		fail("the stall", "a client that stopped reading saw every commit: it was never behind");
+	for (int i = 0; i < CLIENTS; i++) {
+		if (t.client[i].mirror)
+			leave(&t.client[i]);
+		free(t.client[i].buf);
+	}
+	free(t.hash);
+	free(t.known);
 	return 0;
 }

@@ -553,7 +553,8 @@ def a_hundred_connections_that_say_nothing_shut_nobody_out():
         ws = WebSocket(d.port)
         check(ws.code == 101, "a WebSocket among them")
         after = d.status()["memory"]["rss"]
-        check(after - before < 4 << 20, f"they cost {after - before} bytes")
+        most = 16 << 20 if "/sanitize" in BUILD or "/thread" in BUILD else 4 << 20  # sanitizers keep what was freed
+        check(after - before < most, f"they cost {after - before} bytes")
         print(f"note: 100 silent connections cost {max(0, after - before) >> 10} KB")
 
         def drip():

@@ -7,6 +7,7 @@
 #include <netinet/in.h>
 #include <poll.h>
 #include <pthread.h>
+#include <signal.h>
 #include <stdatomic.h>
 #include <stdbool.h>
 #include <stdio.h>
@@ -153,6 +154,7 @@ static inline void peer_start(struct peer *p, bool tcp)
 	socklen_t len = sizeof address;
 	struct termios raw;
 
+	signal(SIGPIPE, SIG_IGN); /* whoever asked may have gone before it is answered */
 	memset(p, 0, sizeof *p);
 	p->fd = p->slave = p->listener = -1;
 	if (tcp) {

@@ -369,15 +369,15 @@ static void errors_come_at_their_rate(void **state)
 {
 	struct bed *b = *state;
 	struct can_frame_at f;
-	int64_t first_ns = 0;
+	int64_t begin_ns = wall_clock_read(CLOCK_REALTIME);
 
 	order(b, "errors", 500, true);
 	for (int i = 0; i < 20; i++) {
 		assert_true(hear(b, b->client[0], &f, false));
 		assert_true(f.id & CAN_WIRE_ERROR && f.id & CAN_WIRE_ERROR_BUS);
-		first_ns = i == 1 ? f.t_ns : first_ns;
 	}
-	assert_true(f.t_ns - first_ns >= 18 * 2 * MS - 3 * MS);
+	/* None comes before its time; where the machine is late, several come at once. */
+	assert_true(f.t_ns - begin_ns >= 19 * 2 * MS - 3 * MS);
 	order(b, "errors", 0, false);
 }
 

@@ -15,7 +15,7 @@ import threading
 import time
 
 BUILD = sys.argv[1]
-PATIENCE_S = 60
+PATIENCE_S = 240
 RAMP_S = 30 / 300  # from the speed of the sweep to none
 # What docs/simulators.md and docs/devices.md say: until the drive notices, and its ramp. The machine is allowed as much again.
 DOCUMENTED_S = {"modbus": 0.3 + RAMP_S, "modbus-tcp": 0.3 + RAMP_S,
@@ -62,6 +62,7 @@ class Bed:
 
     def sweeps_through(self, low, high):
         """It is there, and far from where it is going to."""
+        self.asked_s = time.monotonic()
         angle, speed = self.axis()
         return abs(speed) > 20 and (low < angle < high)
 
@@ -87,17 +88,45 @@ class Bed:
                 process.wait()
 
 
+class Naps(threading.Thread):
+    """For how long the machine keeps somebody waiting who does next to nothing: so it does the simulator."""
+
+    def __init__(self):
+        super().__init__(daemon=True)
+        self.late_s = 0.0
+        self.start()
+
+    def run(self):
+        while True:
+            begin = time.monotonic()
+            time.sleep(0.01)
+            self.late_s += max(0.0, time.monotonic() - begin - 0.011)
+
+
+def kill(bed):
+    """In mid-sweep indeed: a machine that has no time between the look and the kill is asked again."""
+    for _ in range(20):
+        bed.wait("the sweep", lambda: bed.sweeps_through(-20, 0))
+        bed.daemon.kill()
+        killed_ns, late_s = time.time_ns(), time.monotonic() - bed.asked_s
+        bed.daemon.wait()
+        bed.daemon = None
+        if late_s < 0.3:
+            return killed_ns
+        bed.start()
+    raise AssertionError(f"{bed.kind}: the machine has no time to kill a daemon in mid-sweep")
+
+
 def kill_in_mid_sweep(bed):
-    bed.wait("the sweep", lambda: bed.sweeps_through(-20, 0))
-    bed.daemon.kill()
-    killed_ns = time.time_ns()
-    bed.daemon.wait()
-    bed.daemon = None
+    naps = Naps()
+    killed_ns = kill(bed)
+    late_s = naps.late_s
     time.sleep(DOCUMENTED_S[bed.kind] + MACHINE_S)
-    speed = bed.axis()[1]
+    bed.wait("the stand", lambda: abs(bed.axis()[1]) < 0.001)
     moved_ns, angle = bed.stood_at(killed_ns)
     after_s = (moved_ns - killed_ns) / 1e9
-    assert abs(speed) < 0.001, f"{bed.kind}: it moves at {speed} degrees/s, {DOCUMENTED_S[bed.kind] + MACHINE_S:.1f} s after facetd was killed"
+    allowed_s = DOCUMENTED_S[bed.kind] + MACHINE_S + naps.late_s - late_s
+    assert after_s < allowed_s, f"{bed.kind}: it moved until {after_s:.1f} s after facetd was killed, not {allowed_s:.1f} s"
     assert FROM + 5 < angle < TO - 5, f"{bed.kind}: it went on to {angle:.1f} degrees"
     return after_s
 

@@ -20,7 +20,8 @@
 #define PEER_UNITS 4
 
 struct peer {
-	int fd, slave, listener; /* fd: the pty's master, or the TCP connection (-1: none) */
+	atomic_int fd; /* the pty's master, or the TCP connection (-1: none) */
+	int slave, listener;
 	char connect[64];
 	pthread_t thread;
 	atomic_bool stop;

@@ -112,6 +112,8 @@ static void settle(struct recorder *r)
 	}
 	assert_int_equal(status.queued, 0);
 	nanosleep(&(struct timespec){.tv_nsec = 50000000}, NULL);
+	recorder_status(
+	    r, &status); /* under its lock: what it did with a tick, which is not counted, was before what we do next */
 }
 
 struct told {

@@ -1,4 +1,4 @@
-/* The planar reduction of one patch: borders by the rule of law L4, planar regions re-triangulated from their outlines,
+/* The planar reduction of one patch: borders by the rule of law L4, planar regions of few triangles,
  * bounded-error collapse for the rest (design 3 L4, L5; thesis chapter 4).
  *
  * A pure function of the window: both sides of a patch face see the same voxels, so both make the same border. */

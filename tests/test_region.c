@@ -1,4 +1,4 @@
-/* Planar regions: what is flat within the tolerance is cut anew from its outline, what is not is left alone. */
+/* Planar regions: what is flat within the tolerance loses its inside, what is not is left alone. */
 #include <math.h>
 #include <setjmp.h>
 #include <stdarg.h>

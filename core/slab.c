@@ -5,7 +5,7 @@
  * corner that went is handed to the triangle over or under it; one that is too far from that comes back, the farthest of
  * each triangle first, until none is too far.
  *
- * All triangles face the plane's way in the projection along its dominant axis, before and after, so both cover the same
+ * No triangle is turned against the plane in the projection along its dominant axis, before or after, so both cover the same
  * points as often. The projection leaves a coordinate out, which is exact. */
 #include "core/slab.h"
 

@@ -10,7 +10,7 @@ struct slab {
 	struct vec3 *place;      /* [nv] */
 	uint32_t *region;        /* [cap_nt] number of the slab a triangle belongs to, or UINT32_MAX */
 	uint32_t number;         /* of this one */
-	uint32_t *taken, n;      /* its triangles, connected; */
+	uint32_t *taken, n;      /* its triangles, connected */
 	uint32_t standing;       /* slab_thin leaves so many of them, the first */
 	uint32_t *vertex, nv;    /* their corners */
 	int32_t (*projected)[2]; /* [nv] corners as they lie in the plane; slab_thin makes them */

@@ -128,6 +128,69 @@ static void holes_of_a_wall_stay_holes(void **state)
 	arena_finish(&other);
 }
 
+/* How many vertices that are not on the border stand, of how many. */
+static uint32_t inside_left(const struct made *made, uint32_t *ret_inside)
+{
+	uint32_t left = 0;
+	*ret_inside = 0;
+	for (uint32_t v = 0; v < made->s.mesh.nv; v++) {
+		if (made->s.border.kind[v] != BORDER_INSIDE)
+			continue;
+		++*ret_inside;
+		left += made->s.mesh.first[v] != HALFEDGE_NONE;
+	}
+	return left;
+}
+
+/* A floor that runs along a patch face, now a little above it and now below: its outline is full of holes in that face. */
+static int in_a_face(void *ctx, int i, int j, int k)
+{
+	const int *seed = ctx;
+	return k * 256 - 10 + (i * 7 + j * 13 + i * j * *seed) % 31 - 15;
+}
+
+static void a_floor_in_a_patch_face_loses_its_inside(void **state)
+{
+	(void)state;
+	static struct made made;
+	struct arena arena;
+	uint32_t inside;
+	arena_init(&arena);
+	for (int seed = 1; seed <= 5; seed++) {
+		make(&made, in_a_face, &seed, &arena);
+		assert_true(made.stats.regions >= 1);
+		assert_int_equal(made.stats.regions_kept, 0);
+		assert_true(4 * inside_left(&made, &inside) < inside);
+		check_lists(&made);
+	}
+	arena_finish(&arena);
+}
+
+/* Ripples of nearly the tolerance to both sides: a triangle may lie twice as far from a corner that went. */
+static int rough(void *ctx, int i, int j, int k)
+{
+	const int *seed = ctx;
+	return k * 256 - 2100 - i * 20 + 4 * ((i * 7 + j * 13 + i * j * *seed) % 31 - 15);
+}
+
+static void corners_too_far_from_what_is_left_come_back(void **state)
+{
+	(void)state;
+	static struct made made;
+	struct arena arena;
+	arena_init(&arena);
+	for (int seed = 1; seed <= 5; seed++) {
+		uint32_t inside;
+		make(&made, rough, &seed, &arena);
+		assert_true(made.stats.regions >= 1);
+		assert_int_equal(made.stats.regions_kept, 0);
+		assert_true(projected_area(&made.s.mesh) == 2ll * 4096 * 4096);
+		check_lists(&made);
+		assert_true(inside_left(&made, &inside) > 0 && triangles(&made.s.mesh) < made.raw.nt / 2);
+	}
+	arena_finish(&arena);
+}
+
 static int ball(void *ctx, int i, int j, int k)
 {
 	(void)ctx;
@@ -198,6 +261,8 @@ int main(void)
 	const struct CMUnitTest tests[] = {
 	    cmocka_unit_test(a_rippled_wall_is_two_triangles_of_the_same_area),
 	    cmocka_unit_test(holes_of_a_wall_stay_holes),
+	    cmocka_unit_test(a_floor_in_a_patch_face_loses_its_inside),
+	    cmocka_unit_test(corners_too_far_from_what_is_left_come_back),
 	    cmocka_unit_test(a_small_ball_has_no_region),
 	    cmocka_unit_test(two_walls_are_two_regions),
 	    cmocka_unit_test(a_fit_finds_the_plane_through_noise),

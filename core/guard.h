@@ -17,6 +17,8 @@ bool guard_shape(const struct halfedge_mesh *mesh, const struct halfedge_ring *r
 /* Whether the triangle v, b, c turns by less than the angle of cosine `cosine` and does not get thin when v goes to `to`. */
 bool guard_turn(const int32_t v[3], const int32_t to[3], const int32_t b[3], const int32_t c[3], double cosine);
 
+#define GUARD_VALENCE_MAX 24 /* triangles at a vertex that others move into */
+
 #define GUARD_ALTITUDE_MIN (0.01 * LATTICE) /* of a triangle, lattice units */
 
 /* The same of the squared lengths of its normals (as long as twice the area) and their product, and of the square of its

@@ -23,12 +23,11 @@
 #include "core/predicates.h"
 
 #define COSINE_TURN  0.30901699437494742 /* 72 degrees */
-#define VALENCE_MAX  24
-#define RIM_SIDEWAYS 0.5             /* cells */
-#define RIM_GAP      5               /* lattice units a rim vertex keeps from other rim edges, 0.02 cell */
-#define ERROR_SHARE  0.1             /* of the sum of squared distances, in the cost */
-#define WIDE         (1.2 * LATTICE) /* a side beyond which the middle of a triangle is looked at */
-#define LENGTH_SHARE 0.002           /* of the squared way */
+#define RIM_SIDEWAYS 0.5                 /* cells */
+#define RIM_GAP      5                   /* lattice units a rim vertex keeps from other rim edges, 0.02 cell */
+#define ERROR_SHARE  0.1                 /* of the sum of squared distances, in the cost */
+#define WIDE         (1.2 * LATTICE)     /* a side beyond which the middle of a triangle is looked at */
+#define LENGTH_SHARE 0.002               /* of the squared way */
 
 struct target {
 	double cost;
@@ -265,7 +264,7 @@ static bool lay_fan(struct pass *pass, uint32_t u)
 {
 	const struct halfedge_ring *ring = &pass->ring;
 	struct fan *fan = &pass->fan;
-	assert(ring->n <= FAN_MAX); /* with more, VALENCE_MAX refuses it */
+	assert(ring->n <= FAN_MAX); /* with more, GUARD_VALENCE_MAX refuses it */
 	fan_begin(fan, pass->spot[u].at);
 	for (uint32_t k = 0; k < ring->n; k++) {
 		pass->fan_triangle[fan->n] = ring->h[k] / 3;
@@ -483,7 +482,7 @@ static bool try_target(struct pass *pass, uint32_t v, const struct target *targe
 	if (!halfedge_gather(mesh, v, ring))
 		return false;
 	uint32_t after = ring->n + to - (rim ? 2 : 4);
-	if ((after > VALENCE_MAX && after > to) || !halfedge_may_collapse(mesh, ring, h) ||
+	if ((after > GUARD_VALENCE_MAX && after > to) || !halfedge_may_collapse(mesh, ring, h) ||
 	    !guard_patch_faces(mesh, s->border.faces, ring, u, HALFEDGE_NONE) || !lay_fan(pass, u))
 		return false;
 	close_fan(pass, h);

@@ -16,12 +16,11 @@
 #include "core/guard.h"
 #include "core/predicates.h"
 
-#define NONE        UINT32_MAX
-#define STRIPS      (PATCH_SIDE + 1)
-#define PASSES_MAX  4
-#define VALENCE_MAX 24
-#define FLIPS_MAX   8  /* per edge, against rings of equal circles */
-#define ROUNDS_MAX  12 /* of corners that come back */
+#define NONE       UINT32_MAX
+#define STRIPS     (PATCH_SIDE + 1)
+#define PASSES_MAX 4
+#define FLIPS_MAX  8  /* per edge, against rings of equal circles */
+#define ROUNDS_MAX 12 /* of corners that come back */
 
 /* A triangle as it was: half-edges' origins and twins. */
 struct former {
@@ -72,7 +71,7 @@ static bool take_out(struct slab *slab, const struct halfedge_ring *ring)
 			best = distance[k] < distance[best] ? k : best;
 		uint32_t u = ring->x[best], h = ring->h[best];
 		distance[best] = INT64_MAX;
-		if (!turns_stay(slab, ring, u) || halfedge_mark_ring(mesh, u) + ring->n - 4 > VALENCE_MAX ||
+		if (!turns_stay(slab, ring, u) || halfedge_mark_ring(mesh, u) + ring->n - 4 > GUARD_VALENCE_MAX ||
 		    !guard_patch_faces(mesh, slab->s->border.faces, ring, u, HALFEDGE_NONE) ||
 		    !halfedge_may_collapse(mesh, ring, h))
 			continue;

@@ -1,4 +1,4 @@
-/* The triangles of a mesh that lie in a slab about a plane and face its way, made fewer (thesis 4.2 - 4.4). */
+/* The triangles of a mesh that lie in a slab about a plane, none turned against it, made fewer (thesis 4.2). */
 #ifndef FACET_CORE_SLAB_H
 #define FACET_CORE_SLAB_H
 
@@ -14,7 +14,7 @@ struct slab {
 	uint32_t standing;       /* slab_thin leaves so many of them, the first */
 	uint32_t *vertex, nv;    /* their corners */
 	int32_t (*projected)[2]; /* [nv] corners as they lie in the plane; slab_thin makes them */
-	bool *settled;           /* [3 cap_nt] half-edges that Delaunay keeps */
+	bool *settled;           /* [3 nt] half-edges that Delaunay keeps */
 	struct region_plane plane;
 	int axis; /* the plane's dominant one, left out in the projection */
 	bool mirrored;
